@@ -1,0 +1,68 @@
+"""What a data set gives: a template, named shapes with labels, and a split."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+
+import numpy as np
+
+from src.geometry.mesh import Mesh
+
+SPLITS = ("train", "val", "test")
+
+
+class DataError(ValueError):
+    """A data set that is missing or wrong; the message says what, where, and what would mend it."""
+
+
+@dataclass(frozen=True, eq=False)
+class Shape:
+    """One mesh with its ground truth.
+
+    labels: int64 [V], for every vertex its counterpart, a vertex of the data set's template.
+    DataError is raised for a wrong count or a label outside the template.
+    """
+
+    mesh: Mesh
+    labels: np.ndarray
+    template_size: int
+
+    def __post_init__(self) -> None:
+        labels = np.ascontiguousarray(self.labels, dtype=np.int64)
+        vertices = len(self.mesh.vertices)
+        if labels.shape != (vertices,):
+            raise DataError(f"{self.mesh.name}: {vertices} vertices but labels {labels.shape}")
+        bad = np.flatnonzero((labels < 0) | (labels >= self.template_size))
+        if len(bad):
+            raise DataError(
+                f"{self.mesh.name}: {len(bad)} labels outside 0..{self.template_size - 1}, "
+                f"the template's vertices; first: vertex {bad[0]} has {labels[bad[0]]}"
+            )
+        object.__setattr__(self, "labels", labels)
+
+
+class ShapeSet(ABC):
+    """A data set. Meshes are read when asked for, not before.
+
+    template: the reference mesh whose vertices are the labels and on which errors are measured.
+    names: for each of "train", "val" and "test" the names of its shapes, in a fixed order.
+    """
+
+    template: Mesh
+    names: dict[str, list[str]]
+
+    @abstractmethod
+    def load(self, name: str) -> Shape:
+        """The shape of that name. Errors: MeshError, DataError."""
+
+
+def subject_split(names: list[str], per_subject: int = 10) -> dict[str, list[str]]:
+    """The paper's 70/10/20 split of 100 shapes in FAUST's order.
+
+    Shape i shows subject i // 10 in pose i % 10; subjects 0-6 train, 7 validates, 8 and 9 test, so
+    that validation and test show people never seen in training.
+    """
+    subjects = [names[i : i + per_subject] for i in range(0, len(names), per_subject)]
+    groups = {"train": subjects[:7], "val": subjects[7:8], "test": subjects[8:]}
+    return {split: [n for subject in group for n in subject] for split, group in groups.items()}
