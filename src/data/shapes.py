@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import zipfile
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 
@@ -66,3 +68,58 @@ def subject_split(names: list[str], per_subject: int = 10) -> dict[str, list[str
     subjects = [names[i : i + per_subject] for i in range(0, len(names), per_subject)]
     groups = {"train": subjects[:7], "val": subjects[7:8], "test": subjects[8:]}
     return {split: [n for subject in group for n in subject] for split, group in groups.items()}
+
+
+def registered_shape(mesh: Mesh, template: Mesh) -> Shape:
+    """The shape of a mesh numbered like the template: its labels are its vertex numbers.
+
+    Errors: DataError where the two have different numbers of vertices.
+    """
+    size = len(template.vertices)
+    if len(mesh.vertices) != size:
+        raise DataError(
+            f"{mesh.name}: {len(mesh.vertices)} vertices, but the template {template.name} has "
+            f"{size}; a registered mesh has the template's vertices in the template's order"
+        )
+    return Shape(mesh, np.arange(size), size)
+
+
+def read_labels(path: str | Path, vertices: int | None = None) -> np.ndarray:
+    """The labels of one mesh, int64 [V]: for every vertex in its order a vertex of the template.
+
+    path: a text file with one whole number a line, or a `.npy` of integers [V]. vertices: the V
+    to insist on. Errors: DataError, with the path, for a file that is missing or holds anything
+    else, or another V. The range is not checked here but by `Shape`, which knows the template.
+    """
+    path = Path(path)
+    try:
+        labels = _array(path) if path.suffix == ".npy" else _column(path)
+    except OSError as error:
+        raise DataError(f"{path}: cannot read the labels ({error.strerror or error})") from error
+    if vertices is not None and len(labels) != vertices:
+        raise DataError(f"{path}: {len(labels)} labels for a mesh of {vertices} vertices")
+    return labels
+
+
+def _array(path: Path) -> np.ndarray:
+    try:
+        labels = np.load(path, allow_pickle=False)
+    except (ValueError, EOFError, zipfile.BadZipFile) as error:
+        raise DataError(f"{path}: not a readable .npy file ({error})") from error
+    kind = getattr(labels, "dtype", None), getattr(labels, "shape", None)
+    if kind[0] is None or kind[0].kind not in "iu" or len(kind[1]) != 1:
+        raise DataError(f"{path}: labels must be integers [V], got {kind[0]} {kind[1]}")
+    return labels.astype(np.int64)
+
+
+def _column(path: Path) -> np.ndarray:
+    lines = path.read_text(encoding="utf-8-sig", errors="replace").rstrip().splitlines()
+    labels = np.empty(len(lines), dtype=np.int64)
+    for i, line in enumerate(lines):
+        try:
+            labels[i] = int(line)
+        except (ValueError, OverflowError) as error:
+            raise DataError(
+                f"{path}: line {i + 1} is {line[:40]!r}, not the number of a template vertex"
+            ) from error
+    return labels

@@ -1,0 +1,172 @@
+"""What happens beside training: a bar, checkpoints, an orderly stop."""
+
+from __future__ import annotations
+
+import os
+import signal
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import lightning as L
+import torch
+from lightning.pytorch.callbacks import Callback, ProgressBar
+from lightning.pytorch.plugins.io import TorchCheckpointIO
+from tqdm import tqdm
+
+from src.cli import Stopped
+from src.runs import LAST
+
+
+class WholeFiles(TorchCheckpointIO):
+    """Checkpoints that appear whole or not at all, also when the machine stops or the disk fills.
+
+    The previous checkpoint stays until the next one is complete.
+    """
+
+    def save_checkpoint(self, checkpoint: dict[str, Any], path: Any, storage_options=None) -> None:
+        path = Path(path)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        temporary = path.with_name(f"{path.name}.{os.getpid()}.tmp")
+        try:
+            with open(temporary, "wb") as file:
+                torch.save(checkpoint, file)
+                file.flush()
+                os.fsync(file.fileno())
+            os.replace(temporary, path)
+        except (OSError, RuntimeError) as error:  # torch words a full disk as RuntimeError
+            temporary.unlink(missing_ok=True)
+            reason = getattr(error, "strerror", None) or str(error).splitlines()[0]
+            raise OSError(f"cannot write the checkpoint {path} ({reason})") from error
+
+
+class Bar(ProgressBar):
+    """One bar for the whole training, with the time left and the latest figures."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._bar: tqdm | None = None
+
+    def disable(self) -> None:
+        self._enabled = False
+
+    def enable(self) -> None:
+        self._enabled = True
+
+    def on_train_start(self, trainer: L.Trainer, module: L.LightningModule) -> None:
+        total = trainer.max_epochs * trainer.num_training_batches
+        # in a log file every update is a line
+        every = 0.1 if sys.stderr.isatty() else 10.0
+        self._bar = tqdm(total=total, initial=trainer.global_step, desc="Training", unit="step",
+                         mininterval=every, disable=not trainer.is_global_zero,
+                         dynamic_ncols=True)  # fmt: skip
+
+    def on_train_batch_end(self, trainer, module, outputs, batch, batch_idx) -> None:
+        self._bar.update()
+
+    def on_validation_end(self, trainer: L.Trainer, module: L.LightningModule) -> None:
+        values = trainer.callback_metrics
+        if self._bar is not None and "val/exact_match" in values:
+            self._bar.set_postfix_str(
+                f"epoch {trainer.current_epoch + 1}/{trainer.max_epochs}, "
+                f"validation: {100 * values['val/exact_match']:.1f} % exact, "
+                f"error {values['val/geodesic_error']:.4f}",
+                refresh=False,
+            )
+
+    def on_train_end(self, trainer: L.Trainer, module: L.LightningModule) -> None:
+        self._close()
+
+    def on_exception(self, trainer, module, exception) -> None:
+        self._close()
+
+    def _close(self) -> None:
+        if self._bar is not None:
+            self._bar.close()
+            self._bar = None
+
+
+class Speed(Callback):
+    """Logs training steps per second, validation left out, and keeps the time of training.
+
+    seconds: from the first step to now, validation included, in all parts of a run together.
+    """
+
+    def __init__(self) -> None:
+        self._earlier = 0.0
+        self._began: float | None = None
+
+    @property
+    def seconds(self) -> float:
+        return self._earlier + (time.perf_counter() - self._began if self._began else 0.0)
+
+    def on_train_start(self, trainer: L.Trainer, module: L.LightningModule) -> None:
+        self._began = time.perf_counter()
+        self._steps, self._busy = 0, 0.0
+
+    def on_train_end(self, trainer: L.Trainer, module: L.LightningModule) -> None:
+        self._earlier, self._began = self.seconds, None
+
+    def on_train_batch_start(self, trainer, module, batch, batch_idx) -> None:
+        self._started = time.perf_counter()
+
+    def on_train_batch_end(self, trainer, module, outputs, batch, batch_idx) -> None:
+        self._steps += 1
+        self._busy += time.perf_counter() - self._started
+
+    def on_train_epoch_end(self, trainer: L.Trainer, module: L.LightningModule) -> None:
+        if self._busy > 0:
+            module.log("train/steps_per_second", self._steps / self._busy, batch_size=1)
+        self._steps, self._busy = 0, 0.0
+
+    def state_dict(self) -> dict[str, float]:
+        return {"seconds": self.seconds}
+
+    def load_state_dict(self, state: dict[str, float]) -> None:
+        self._earlier = state["seconds"]
+
+
+class OrderlyStop(Callback):
+    """On Ctrl-C or SIGTERM: finish the step, save last.ckpt, and stop.
+
+    The same signal a second time stops at once; last.ckpt is then that of the last whole epoch.
+    """
+
+    def __init__(self, folder: Path):
+        self.folder = folder
+        self.signum: int | None = None
+        self._before: dict[int, Any] = {}
+
+    def on_train_start(self, trainer: L.Trainer, module: L.LightningModule) -> None:
+        for signum in (signal.SIGINT, signal.SIGTERM):
+            self._before[signum] = signal.signal(signum, self._note)
+
+    def _note(self, signum: int, frame: object) -> None:
+        if self.signum is not None:
+            raise Stopped(signum)
+        self.signum = signum
+        print("\nstopping after this step ...", file=sys.stderr)
+
+    def on_train_batch_start(self, trainer, module, batch, batch_idx) -> None:
+        # Between two steps, and not before the last of an epoch: there Lightning can't tell a
+        # finished epoch from an unfinished one. The start of an epoch is in last.ckpt already.
+        if self.signum is None or 0 < batch_idx == trainer.num_training_batches - 1:
+            return
+        last = self.folder / LAST
+        if batch_idx > 0 or not last.exists():
+            trainer.save_checkpoint(last)
+        raise Stopped(self.signum)
+
+    def on_train_end(self, trainer: L.Trainer, module: L.LightningModule) -> None:
+        self._restore()
+        if self.signum is not None:
+            raise Stopped(self.signum)
+
+    def teardown(self, trainer: L.Trainer, module: L.LightningModule, stage: str) -> None:
+        self._restore()
+
+    def _restore(self) -> None:
+        for signum, handler in self._before.items():
+            signal.signal(signum, handler)
+        self._before = {}

@@ -1,0 +1,100 @@
+"""What all entry points share: a config from Hydra, and one clear message for each mistake."""
+
+from __future__ import annotations
+
+import logging
+import os
+import signal
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import hydra
+from hydra.errors import HydraException
+from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+
+from src.config import ConfigError, checked
+from src.data.shapes import DataError
+from src.geometry.mesh import MeshError
+from src.runs import RunError
+
+CONF = str(Path(__file__).parents[1] / "conf")
+USER_ERRORS = (ConfigError, DataError, MeshError, RunError, OSError, HydraException,
+               OmegaConfBaseException)  # fmt: skip
+
+log = logging.getLogger("src")
+
+
+class Stopped(BaseException):
+    """Ctrl-C or SIGTERM. The message says how to go on."""
+
+    def __init__(self, signum: int, message: str = "stopped"):
+        super().__init__(message)
+        self.signum = signum
+
+
+def run_folder(resume: str | None, new: str) -> str:
+    """Hydra's run folder: that of the run to go on with, if it is there."""
+    return resume if resume and Path(resume).is_dir() else new
+
+
+def entry_point(name: str) -> Callable[[Callable[[DictConfig], None]], Callable[[], None]]:
+    """Make `task(config)` a program with the config conf/<name>.yaml.
+
+    A mistake of the user ends it with one message and exit code 1 (2 if the command line can't be
+    read), Ctrl-C with 130 and SIGTERM with 143. Anything else is an error of ours and shows its
+    traceback.
+    """
+
+    def decorate(task: Callable[[DictConfig], None]) -> Callable[[], None]:
+        def job(config: DictConfig) -> None:
+            try:
+                task(checked(config))
+            except USER_ERRORS as error:
+                log.error("error: %s", one_line(error))
+                error.said = True
+                raise
+            except Exception:
+                log.exception("error: this should not have happened")
+                raise
+
+        def main() -> None:
+            os.environ.setdefault("HYDRA_FULL_ERROR", "1")  # Hydra hands errors on: we word them
+            OmegaConf.register_new_resolver("run_folder", run_folder, replace=True)
+            signal.signal(signal.SIGTERM, _stop)
+            signal.signal(signal.SIGINT, _stop)
+            try:
+                hydra.main(config_path=CONF, config_name=name, version_base="1.3")(job)()
+            except Stopped as stopped:
+                print(f"\n{stopped}", file=sys.stderr)
+                sys.exit(128 + stopped.signum)
+            except USER_ERRORS as error:
+                if not getattr(error, "said", False):
+                    print(f"error: {one_line(error)}", file=sys.stderr)
+                sys.exit(2 if isinstance(error, HydraException) else 1)
+
+        return main
+
+    return decorate
+
+
+def _stop(signum: int, frame: object) -> None:
+    raise Stopped(signum)
+
+
+def one_line(error: BaseException) -> str:
+    """An error in one line, for Hydra's and the operating system's errors too."""
+    if isinstance(error, HydraException | OmegaConfBaseException):
+        lines = [line.strip() for line in str(error).splitlines() if line.strip()]
+        for i, line in enumerate(lines):
+            if line.startswith("Available options in"):
+                end = next((j for j in range(i, len(lines)) if lines[j].startswith("Config search")),
+                           len(lines))  # fmt: skip
+                return f"{lines[0]}; there are: {', '.join(lines[i + 1 : end])}"
+        cause = error.__cause__
+        reason = f" ({str(cause).splitlines()[0]})" if cause is not None and str(cause) else ""
+        return lines[0] + reason
+    if type(error).__module__ == "builtins" and isinstance(error, OSError) and error.filename:
+        return f"{error.filename}: {error.strerror}"
+    return str(error)

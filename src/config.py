@@ -1,0 +1,176 @@
+"""What a user may set, with types; and what is said of a mistake."""
+
+from __future__ import annotations
+
+import difflib
+from dataclasses import dataclass, field, fields
+from typing import Any
+
+from omegaconf import MISSING, DictConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+
+
+class ConfigError(ValueError):
+    """A setting that can't be; the message names the key, the rule and the value."""
+
+
+@dataclass
+class Model:
+    name: str = MISSING
+    channels: list[int] = MISSING
+    metric: bool = False
+    metric_layers: str = "all"
+    dropout: float = 0.3
+    feature_scale: float = 1.0
+
+
+@dataclass
+class LSTM(Model):
+    rings: int | None = None
+
+
+@dataclass
+class Shot:
+    radius: float = MISSING
+    bins: int = 16
+
+
+@dataclass
+class Data:
+    name: str = MISSING
+    shot: Shot = field(default_factory=Shot)
+    shuffle_vertices: bool = False
+    cache_dir: str = MISSING
+    workers: int | None = None
+
+
+@dataclass
+class Bodies(Data):
+    vertices: int = 1500
+
+
+@dataclass
+class Faust(Data):
+    root: str | None = None
+
+
+@dataclass
+class FaustBenchmark(Data):
+    root: str | None = None
+    benchmark_root: str | None = None
+    policy: str = "iso"
+    train: list[str] | None = None
+
+
+@dataclass
+class Folder(Data):
+    root: str | None = None
+    template: str | None = None
+    train: Any = field(default_factory=list)
+    val: Any = field(default_factory=list)
+    test: Any = field(default_factory=list)
+    labels: str | None = "{stem}.txt"
+
+
+@dataclass
+class Optim:
+    epochs: int = MISSING
+    lr: float = MISSING
+    betas: list[float] = field(default_factory=lambda: [0.9, 0.999])
+    schedule: str = MISSING
+    warmup: float = 0.1
+
+
+@dataclass
+class Trainer:
+    accelerator: str = "cpu"
+    devices: Any = 1
+    strategy: str = "auto"
+    precision: str = "32"
+    threads: int | None = None
+    val_every: int = 1
+
+
+@dataclass
+class Train:
+    seq_len: int = MISSING
+    metric: bool | None = None
+    seed: int = 0
+    resume: str | None = None
+    model: Any = MISSING
+    data: Any = MISSING
+    trainer: Trainer = field(default_factory=Trainer)
+    optim: Optim = field(default_factory=Optim)
+    picture: bool = True
+
+
+MODELS = {"fcs": Model, "lstm": LSTM}
+DATASETS = {"bodies": Bodies, "faust": Faust, "faust_benchmark": FaustBenchmark, "folder": Folder}
+
+AT_LEAST = {
+    "seq_len": 1, "seed": 0, "optim.epochs": 1, "optim.warmup": 0, "data.workers": 1,
+    "data.shot.bins": 1, "model.rings": 1, "trainer.threads": 1, "trainer.val_every": 1,
+}  # fmt: skip
+ABOVE_ZERO = ("optim.lr", "data.shot.radius", "model.feature_scale")
+ONE_OF = {
+    "optim.schedule": ("cosine", "constant"),
+    "model.metric_layers": ("all", "first"),
+    "trainer.precision": ("32", "64", "bf16", "auto"),
+}
+
+
+def checked(config: DictConfig) -> DictConfig:
+    """The composed config with every value of its declared type, within its range.
+
+    Errors: ConfigError for an unknown key, a value of another type, or one out of range.
+    """
+    typed = OmegaConf.structured(Train)
+    plain = OmegaConf.to_container(config, resolve=True)
+    for group, schemas in (("model", MODELS), ("data", DATASETS)):
+        name = plain.get(group, {}).get("name")
+        if name not in schemas:
+            raise ConfigError(f"{group}.name must be one of {', '.join(schemas)}; got {name}")
+        _known(plain[group], schemas[name], f"{group}.")
+        typed[group] = OmegaConf.structured(schemas[name])
+    _known(plain, Train, "")
+    _known(plain["trainer"], Trainer, "trainer.")
+    _known(plain["optim"], Optim, "optim.")
+    _known(plain["data"]["shot"], Shot, "data.shot.")
+    if plain["model"].get("metric") is None:
+        plain["model"]["metric"] = False
+    for key, value in _leaves(plain):
+        try:
+            OmegaConf.update(typed, key, value)
+        except OmegaConfBaseException as error:
+            reason = str(error).splitlines()[0]
+            raise ConfigError(f"{key}={value}: {reason}") from error
+    for key, least in AT_LEAST.items():
+        value = OmegaConf.select(typed, key)
+        if value is not None and value < least:
+            raise ConfigError(f"{key} must be at least {least}; got {value}")
+    for key in ABOVE_ZERO:
+        if not OmegaConf.select(typed, key) > 0:
+            raise ConfigError(f"{key} must be above 0; got {OmegaConf.select(typed, key)}")
+    for key, values in ONE_OF.items():
+        if (value := OmegaConf.select(typed, key)) not in values:
+            raise ConfigError(f"{key} must be one of {', '.join(values)}; got {value}")
+    if not 0 <= typed.model.dropout < 1:
+        raise ConfigError(f"model.dropout must be in 0..1, 1 left out; got {typed.model.dropout}")
+    return typed
+
+
+def _leaves(tree: dict[str, Any], prefix: str = ""):
+    for key, value in tree.items():
+        if isinstance(value, dict):
+            yield from _leaves(value, f"{prefix}{key}.")
+        else:
+            yield prefix + key, value
+
+
+def _known(given: dict[str, Any], schema: type, prefix: str) -> None:
+    names = [f.name for f in fields(schema)]
+    for key in given:
+        if key not in names:
+            close = difflib.get_close_matches(key, names, n=1)
+            hint = f"did you mean {prefix}{close[0]}?" if close else f"known: {', '.join(names)}"
+            raise ConfigError(f"unknown key {prefix}{key}; {hint}")

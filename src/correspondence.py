@@ -1,0 +1,121 @@
+"""Training and testing a network that gives every vertex its counterpart on the template."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import lightning as L
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from src.data.datamodule import Batch, derived_seed
+from src.figures import curve_figure
+from src.metrics import THRESHOLDS, CorrespondenceError, geodesic_errors
+from src.nn.layers import metric_features
+from src.nn.loss import linear_cross_entropy, predict
+from src.nn.networks import FCSNet, LSTMNet
+
+
+def build_network(model: dict[str, Any], seq_len: int, in_features: int, num_classes: int):
+    """The network that a model config describes. Its names are a closed list: a checkpoint's
+    config can't name code to run."""
+    options = {k: v for k, v in model.items() if k not in ("name", "rings")}
+    if model["name"] == "fcs":
+        return FCSNet(in_features, num_classes, seq_len, **options)
+    if model["name"] == "lstm":
+        return LSTMNet(in_features, num_classes, **options)
+    raise ValueError(f"model.name must be fcs or lstm, got {model['name']!r}")
+
+
+class Correspondence(L.LightningModule):
+    """Cross-entropy over the template's vertices; Adam.
+
+    config: the whole composed config in plain containers, so that a checkpoint brings it along.
+    in_features: channels of the descriptor. num_classes: vertices of the template.
+    """
+
+    def __init__(self, config: dict[str, Any], in_features: int, num_classes: int):
+        super().__init__()
+        self.save_hyperparameters()
+        self.net: nn.Module = build_network(
+            config["model"], config["seq_len"], in_features, num_classes
+        )
+        self.optim = config["optim"]
+        self.seed = config["seed"]
+        self.errors = nn.ModuleDict({split: CorrespondenceError() for split in ("val", "test")})
+        self.curves: dict[str, np.ndarray] = {}  # of the latest evaluation of each split
+        self.predictions: dict[int, np.ndarray] = {}  # of the latest test, by mesh
+
+    def setup(self, stage: str) -> None:
+        self.distances = self.trainer.datamodule.reference()
+
+    def embed(self, batch: Batch) -> Tensor:
+        metric = None
+        if self.net.metric:
+            metric = metric_features(batch["vertices"], batch["spirals"], batch["unit"])
+        return self.net.embed(batch["features"], batch["spirals"], metric)
+
+    def on_train_batch_start(self, batch: Batch, batch_idx: int) -> None:
+        # Dropout depends on seed, epoch and mesh alone, as all other chance does: a run that was
+        # stopped anywhere goes on as if it had not been.
+        seed = derived_seed(self.seed, "dropout", self.current_epoch, batch["index"])
+        torch.manual_seed(seed % 2**63)
+
+    def training_step(self, batch: Batch, batch_idx: int) -> Tensor:
+        head = self.net.head
+        loss = linear_cross_entropy(self.embed(batch), head.weight, head.bias, batch["labels"])
+        self.log("train/loss", loss, on_step=True, on_epoch=True, batch_size=1)
+        return loss
+
+    def validation_step(self, batch: Batch, batch_idx: int) -> None:
+        self._evaluate("val", batch)
+
+    def test_step(self, batch: Batch, batch_idx: int) -> None:
+        self.predictions[batch["index"]] = self._evaluate("test", batch)
+
+    def _evaluate(self, split: str, batch: Batch) -> np.ndarray:
+        x, head = self.embed(batch), self.net.head
+        loss = linear_cross_entropy(x, head.weight, head.bias, batch["labels"])
+        self.log(f"{split}/loss", loss, batch_size=1, sync_dist=True)
+        predicted = predict(x, head.weight, head.bias).cpu().numpy()
+        labels = batch["labels"].cpu().numpy()
+        errors = geodesic_errors(predicted, labels, self.distances)
+        self.errors[split].update(errors, predicted == labels)
+        return predicted
+
+    def on_validation_epoch_end(self) -> None:
+        self._report("val")
+
+    def on_test_epoch_end(self) -> None:
+        self._report("test")
+
+    def _report(self, split: str) -> None:
+        values = self.errors[split].compute()
+        self.errors[split].reset()
+        self.curves[split] = values.pop("curve").cpu().numpy()
+        values["geodesic_error_diameter"] = values["geodesic_error"] / self.distances.diameter
+        for name, value in values.items():
+            # already over all meshes of all ranks, so nothing is left to average
+            self.log(f"{split}/{name}", value.float(), batch_size=1)
+        if self.logger is not None and not self.trainer.sanity_checking:
+            figure = curve_figure({split: (THRESHOLDS, self.curves[split])})
+            self.logger.experiment.add_figure(f"{split}/curve", figure, self.current_epoch)
+
+    def configure_optimizers(self) -> dict[str, Any]:
+        optim = self.optim
+        adam = torch.optim.Adam(self.parameters(), lr=optim["lr"], betas=tuple(optim["betas"]))
+        if optim["schedule"] == "constant":
+            return {"optimizer": adam}
+        steps = max(1, int(self.trainer.estimated_stepping_batches))
+        warmup = max(1, round(optim["warmup"] * steps))
+
+        def factor(step: int) -> float:
+            """Linear from near 0 to 1, then half a cosine down to near 0."""
+            if step < warmup:
+                return (step + 1) / warmup
+            return 0.5 * (1 + math.cos(math.pi * (step - warmup) / max(1, steps - warmup)))
+
+        schedule = torch.optim.lr_scheduler.LambdaLR(adam, factor)
+        return {"optimizer": adam, "lr_scheduler": {"scheduler": schedule, "interval": "step"}}

@@ -1,0 +1,200 @@
+"""One mesh per batch, and a fresh spiral around every vertex each time it is served."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Iterator
+
+import lightning as L
+import numpy as np
+import torch
+from torch.utils.data import DataLoader, Dataset, Sampler
+from tqdm import tqdm
+
+from src.data.preprocessing import Recipe, descriptor_task, load_task, run_tasks, spiral_task
+from src.data.reference import ReferenceDistances
+from src.data.shapes import SPLITS, Shape, ShapeSet
+from src.data.store import Store, digest
+
+log = logging.getLogger(__name__)
+
+Batch = dict[str, torch.Tensor | int]
+
+
+def derived_seed(*parts: int | str) -> int:
+    """A seed for one purpose: the same parts give the same number, other parts another."""
+    return int(digest(*parts)[:15], 16)
+
+
+def draw_spirals(
+    sequences: torch.Tensor, first: torch.Tensor, generator: torch.Generator | None = None
+) -> torch.Tensor:
+    """For every vertex one of its spirals, each start equally likely: int64 [V, N].
+
+    sequences: int [R, N] and first: int64 [V+1], a `SpiralTable` on any device; the generator must
+    be on the same one.
+    """
+    starts = first.diff()
+    draw = torch.rand(len(starts), device=first.device, generator=generator)
+    # rand < 1, but the product of a large float32 below 1 and the count may round up to the count
+    step = (draw * starts).long().clamp(max=starts - 1)
+    return sequences.index_select(0, first[:-1] + step).long()
+
+
+class MeshDataset(Dataset):
+    """The tensors of one split. Item i is a dictionary, without a batch dimension:
+
+    features float32 [V, C]; labels int64 [V]; vertices float32 [V, 3]; unit float32 [], the length
+    that metric information is divided by; sequences int32 [R, N] and first int64 [V+1], the spiral
+    table; index int, i.
+    """
+
+    def __init__(self, names: list[str], items: list[Batch]):
+        self.names, self.items = names, items
+
+    def __len__(self) -> int:
+        return len(self.items)
+
+    def __getitem__(self, i: int) -> Batch:
+        return {**self.items[i], "index": i}
+
+
+class EpochSampler(Sampler[int]):
+    """A fresh order in every epoch, the same for the same seed and epoch.
+
+    `skip` leaves out as many items at the beginning of the first epoch served: those that a run
+    had done before it was stopped.
+    """
+
+    def __init__(self, size: int, seed: int, skip: int = 0):
+        self.size, self.seed, self.skip, self.epoch = size, seed, skip, 0
+
+    def set_epoch(self, epoch: int) -> None:
+        """Called by Lightning before each epoch."""
+        self.epoch = epoch
+
+    def __len__(self) -> int:
+        return self.size
+
+    def __iter__(self) -> Iterator[int]:
+        order = np.random.default_rng([self.seed, self.epoch]).permutation(self.size).tolist()
+        skip, self.skip = self.skip, 0
+        yield from order[skip:]
+
+
+class CorrespondenceData(L.LightningDataModule):
+    """A data set as batches of one mesh, with the spirals of this iteration.
+
+    Each batch is an item of `MeshDataset` on the device of the run, with `spirals` int64 [V, N]
+    in the place of the table. In training the start of every spiral is drawn anew in every
+    iteration, from (seed, epoch, mesh) alone: an interrupted run goes on with the very draws it
+    would have made. In validation and test it is drawn from (seed, mesh): figures are repeatable.
+
+    shuffle_vertices renumbers every mesh at random when it is read.
+    """
+
+    def __init__(
+        self,
+        shapes: ShapeSet,
+        recipe: Recipe,
+        store: Store,
+        seed: int = 0,
+        shuffle_vertices: bool = False,
+        workers: int | None = None,
+    ):
+        super().__init__()
+        self.shapes, self.recipe, self.store = shapes, recipe, store
+        self.seed, self.shuffle_vertices, self.workers = seed, shuffle_vertices, workers
+        self.datasets: dict[str, MeshDataset] = {}
+        self._skip = 0
+
+    @property
+    def num_classes(self) -> int:
+        return len(self.shapes.template.vertices)
+
+    @property
+    def in_features(self) -> int:
+        return 32 * (self.recipe.shot_bins + 1)
+
+    def reference(self) -> ReferenceDistances:
+        """Distances on the template, in units of the square root of its area."""
+        return ReferenceDistances(self.shapes.template, self.store)
+
+    def shape(self, name: str) -> Shape:
+        """A shape as it is served: renumbered, if shuffle_vertices says so."""
+        shape = self.shapes.load(name)
+        if not self.shuffle_vertices:
+            return shape
+        rng = np.random.default_rng(derived_seed(self.seed, "shuffle", name))
+        order = rng.permutation(len(shape.labels))
+        return Shape(shape.mesh.renumbered(order), shape.labels[order], shape.template_size)
+
+    def setup(self, stage: str | None = None) -> None:
+        splits = {"fit": ("train", "val"), "validate": ("val",), "test": ("test",)}
+        wanted = [s for s in splits.get(stage, SPLITS) if s not in self.datasets]
+        self.prepare(wanted)
+
+    def prepare(self, wanted: list[str] | tuple[str, ...] = SPLITS) -> None:
+        """Read the meshes of those splits, compute what is not on disk yet, and load it."""
+        names = [(split, name) for split in wanted for name in self.shapes.names[split]]
+        shapes, tasks = [], []
+        for _, name in tqdm(names, desc="Meshes", unit="mesh", delay=1.0):
+            shape = self.shape(name)
+            shapes.append(shape)
+            tasks.append(
+                (descriptor_task(shape.mesh, self.recipe), spiral_task(shape.mesh, self.recipe))
+            )
+        run_tasks((t for t, _ in tasks), self.store, self.workers, "Descriptors")
+        run_tasks((t for _, t in tasks), self.store, self.workers, "Spirals")
+        loaded: dict[str, dict[str, torch.Tensor]] = {}  # meshes share the tables they have alike
+        items: dict[str, list[Batch]] = {split: [] for split in wanted}
+        progress = tqdm(zip(names, shapes, tasks, strict=True), total=len(names),
+                        desc="Loading", unit="mesh", delay=1.0)  # fmt: skip
+        for (split, name), shape, (descriptors, spirals) in progress:
+            if spirals.key not in loaded:
+                loaded[spirals.key] = _tensors(load_task(spirals, self.store))
+            item = _tensors(load_task(descriptors, self.store)) | loaded[spirals.key]
+            if undefined := int(item.pop("undefined")):
+                log.warning("%s: no descriptor at %d of %d vertices; zeros stand there",
+                            name, undefined, len(shape.labels))  # fmt: skip
+            item["labels"] = torch.from_numpy(shape.labels)
+            item["vertices"] = torch.from_numpy(shape.mesh.vertices.astype(np.float32))
+            item["unit"] = torch.tensor(
+                self.recipe.shot_radius * np.sqrt(shape.mesh.area), dtype=torch.float32
+            )
+            items[split].append(item)
+        for split in wanted:
+            self.datasets[split] = MeshDataset(self.shapes.names[split], items[split])
+
+    def train_dataloader(self) -> DataLoader:
+        skip, self._skip = self._skip, 0
+        sampler = EpochSampler(len(self.datasets["train"]), self.seed, skip)
+        return DataLoader(self.datasets["train"], batch_size=None, sampler=sampler)
+
+    def val_dataloader(self) -> DataLoader:
+        return DataLoader(self.datasets["val"], batch_size=None)
+
+    def test_dataloader(self) -> DataLoader:
+        return DataLoader(self.datasets["test"], batch_size=None)
+
+    def on_after_batch_transfer(self, batch: Batch, dataloader_idx: int) -> Batch:
+        batch = dict(batch)
+        trainer = self.trainer
+        when = f"epoch {trainer.current_epoch}" if trainer.training else "evaluation"
+        sequences, first = batch.pop("sequences"), batch.pop("first")
+        generator = torch.Generator(first.device)
+        generator.manual_seed(derived_seed(self.seed, "spirals", when, batch["index"]))
+        batch["spirals"] = draw_spirals(sequences, first, generator)
+        return batch
+
+    def state_dict(self) -> dict[str, int]:
+        progress = self.trainer.fit_loop.epoch_loop.batch_progress.current
+        done = progress.completed
+        return {"skip": 0 if done >= self.trainer.num_training_batches else done}
+
+    def load_state_dict(self, state: dict[str, int]) -> None:
+        self._skip = state["skip"]
+
+
+def _tensors(arrays: dict[str, np.ndarray]) -> dict[str, torch.Tensor]:
+    return {name: torch.from_numpy(array) for name, array in arrays.items()}

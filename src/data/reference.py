@@ -1,0 +1,67 @@
+"""Geodesic distances on the template: what an error is measured with."""
+
+from __future__ import annotations
+
+import numpy as np
+from tqdm import tqdm
+
+from src.data.store import Store, code_version, digest
+from src.geometry import geodesics
+from src.geometry.mesh import Mesh
+
+BLOCK = 256  # rows kept in one file
+
+
+class ReferenceDistances:
+    """Distances between template vertices over sqrt(template area), computed as they are needed.
+
+    Rows are computed in blocks of neighbouring vertex numbers and kept on disk and in memory.
+    diameter: the template's geodesic diameter, over sqrt(area) too, so that an error over the
+    diameter is an error over sqrt(area) divided by it. Between two components of the template
+    there is no path; such a distance counts as the diameter.
+    """
+
+    def __init__(self, template: Mesh, store: Store):
+        self.template, self._store = template, store
+        self._blocks: dict[int, np.ndarray] = {}
+        self._solver: geodesics.GeodesicSolver | None = None
+        self._key = digest(template.vertices, template.faces, BLOCK, code_version(geodesics))
+        self._unit = np.sqrt(template.area)
+        self.diameter = float(
+            store.get("diameter", self._key, self._compute_diameter)["diameter"]
+        )  # fmt: skip
+
+    def __call__(self, sources: np.ndarray, targets: np.ndarray) -> np.ndarray:
+        """float64 [K]: the distance from sources[k] to targets[k], both int64 [K]."""
+        distances = np.zeros(len(sources))
+        apart = np.flatnonzero(sources != targets)
+        blocks = sources[apart] // BLOCK
+        self._ensure(np.unique(blocks))
+        for block in np.unique(blocks):
+            pairs = apart[blocks == block]
+            distances[pairs] = self._blocks[block][sources[pairs] % BLOCK, targets[pairs]]
+        return distances
+
+    def _ensure(self, blocks: np.ndarray) -> None:
+        missing = [int(block) for block in blocks if block not in self._blocks]
+        rows = len(missing) * BLOCK * len(self.template.vertices)
+        quiet = rows < 1e6 or all(self._store.has(*self._entry(block)) for block in missing)
+        for block in tqdm(missing, desc="Geodesic distances", unit="block", leave=False,
+                          disable=quiet, delay=1.0):  # fmt: skip
+            kind, key = self._entry(block)
+            self._blocks[block] = self._store.get(kind, key, lambda b=block: self._compute(b))[
+                "distances"
+            ]
+
+    def _entry(self, block: int) -> tuple[str, str]:
+        return "distances", f"{self._key}-{block}"
+
+    def _compute(self, block: int) -> dict[str, np.ndarray]:
+        self._solver = self._solver or geodesics.GeodesicSolver(self.template)
+        last = min((block + 1) * BLOCK, len(self.template.vertices))
+        rows = np.stack([self._solver.row(v) for v in range(block * BLOCK, last)]) / self._unit
+        rows[~np.isfinite(rows)] = self.diameter
+        return {"distances": rows.astype(np.float32)}
+
+    def _compute_diameter(self) -> dict[str, np.ndarray]:
+        return {"diameter": np.array(geodesics.diameter(self.template) / self._unit)}

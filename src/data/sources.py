@@ -1,0 +1,20 @@
+"""The data sets by name, as a config names them."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from src.data.bodies import Bodies
+from src.data.faust import Faust
+from src.data.faust_benchmark import FaustBenchmark
+from src.data.folder import Folder
+from src.data.shapes import ShapeSet
+
+SOURCES = {"bodies": Bodies, "faust": Faust, "faust_benchmark": FaustBenchmark, "folder": Folder}
+COMMON = ("name", "shot", "shuffle_vertices", "cache_dir", "workers")  # not the source's affair
+
+
+def open_shapes(data: dict[str, Any]) -> ShapeSet:
+    """The data set that a data config describes. Errors: DataError, MeshError."""
+    options = {key: value for key, value in data.items() if key not in COMMON}
+    return SOURCES[data["name"]](**options)

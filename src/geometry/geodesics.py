@@ -1,0 +1,60 @@
+"""Geodesic distances on a mesh, by the heat method (Crane et al. 2013) of potpourri3d."""
+
+from __future__ import annotations
+
+import numpy as np
+import potpourri3d
+
+from src.geometry.mesh import Mesh
+
+
+class GeodesicSolver:
+    """Distances from single vertices, in the mesh's unit; the factorisation is made once.
+
+    The heat method is a smooth approximation, within about one per cent at ordinary resolutions.
+    From one component to another there is no distance: inf.
+    """
+
+    def __init__(self, mesh: Mesh):
+        self._solver = potpourri3d.MeshHeatMethodDistanceSolver(mesh.vertices, mesh.faces)
+        self._component = _components(mesh)
+
+    def row(self, source: int) -> np.ndarray:
+        """float64 [V], the distance of every vertex to `source`; exactly 0 at the source."""
+        row = np.maximum(self._solver.compute_distance(int(source)), 0.0)
+        row[source] = 0.0
+        row[self._component != self._component[source]] = np.inf
+        return row
+
+
+def diameter(mesh: Mesh, sweeps: int = 8) -> float:
+    """The largest geodesic distance between two vertices of the largest component.
+
+    Estimated from below: from any vertex to the farthest, from there to the farthest from both,
+    and so on (farthest-point sampling), `sweeps` times; the largest distance seen.
+    """
+    solver = GeodesicSolver(mesh)
+    nearest = np.full(len(mesh.vertices), np.inf)
+    component = _components(mesh)
+    largest, source = 0.0, int(np.argmax(component == np.bincount(component).argmax()))
+    for sweep in range(sweeps + 1):
+        row = solver.row(source)
+        row = np.where(np.isfinite(row), row, 0.0)
+        if sweep:  # the first vertex only leads to an end of the shape
+            largest = max(largest, float(row.max()))
+            nearest = np.minimum(nearest, row)
+            source = int(nearest.argmax())
+        else:
+            source = int(row.argmax())
+    return largest
+
+
+def _components(mesh: Mesh) -> np.ndarray:
+    """int [V], a number for the connected component of each vertex."""
+    from scipy.sparse import coo_matrix
+    from scipy.sparse.csgraph import connected_components
+
+    start, tip = mesh.faces[:, [0, 1, 1, 2]].reshape(-1, 2).T
+    count = len(mesh.vertices)
+    graph = coo_matrix((np.ones(len(start), dtype=bool), (start, tip)), shape=(count, count))
+    return connected_components(graph, directed=False)[1]

@@ -1,0 +1,79 @@
+"""Errors of a correspondence, and the curve of Kim et al. 2011.
+
+Every error here is a geodesic distance on the template between the predicted vertex and the true
+one, over the square root of the template's area. Over the geodesic diameter it is the same number
+divided by the diameter; the literature has both, so names say which.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import torch
+from torchmetrics import Metric
+
+THRESHOLDS = np.arange(201) / 1000  # of sqrt(area): 0 to 0.2, as in the paper's figures
+REPORTED = (0.01, 0.05, 0.10)
+
+
+def geodesic_errors(
+    predicted: np.ndarray,
+    labels: np.ndarray,
+    distances: Callable[[np.ndarray, np.ndarray], np.ndarray],
+) -> np.ndarray:
+    """float64 [V]: distances(labels, predicted), 0 where they agree.
+
+    predicted, labels: int64 [V], vertices of the template. distances: from sources [K] to targets
+    [K], for instance `ReferenceDistances`.
+    """
+    return distances(labels, predicted)
+
+
+def correspondence_curve(errors: np.ndarray, thresholds: np.ndarray = THRESHOLDS) -> np.ndarray:
+    """float64 [T]: the share of errors that are at most each threshold (Kim et al. 2011).
+
+    errors: [V]. thresholds: [T], ascending, inclusive: the value at 0 is the exact-match rate.
+    NaN where there are no errors at all.
+    """
+    if len(errors) == 0:
+        return np.full(len(thresholds), np.nan)
+    return np.searchsorted(np.sort(errors), thresholds, side="right") / len(errors)
+
+
+class CorrespondenceError(Metric):
+    """The errors of whole meshes, pooled over all vertices of all of them.
+
+    compute() gives a dictionary of scalars: exact_match, geodesic_error (the mean),
+    within_0.01, within_0.05, within_0.10; and `curve`, [T] over THRESHOLDS.
+    """
+
+    full_state_update = False
+
+    def __init__(self) -> None:
+        super().__init__()
+        for name in ("vertices", "exact", "error"):
+            self.add_state(name, torch.zeros((), dtype=torch.float64), dist_reduce_fx="sum")
+        counts = torch.zeros(len(THRESHOLDS), dtype=torch.float64)
+        self.add_state("within", counts, dist_reduce_fx="sum")
+
+    def update(self, errors: np.ndarray, exact: np.ndarray) -> None:
+        """errors: float [V], over sqrt(area). exact: bool [V], the right vertex was hit."""
+        self.vertices += len(errors)
+        self.exact += int(exact.sum())
+        self.error += float(errors.sum())
+        if len(errors):
+            shares = torch.from_numpy(correspondence_curve(errors))
+            self.within += (shares * len(errors)).round().to(self.within.device)
+
+    def compute(self) -> dict[str, torch.Tensor]:
+        curve = self.within / self.vertices
+        return {
+            "exact_match": self.exact / self.vertices,
+            "geodesic_error": self.error / self.vertices,
+            **{
+                f"within_{radius:.2f}": curve[int(np.searchsorted(THRESHOLDS, radius))]
+                for radius in REPORTED
+            },
+            "curve": curve,
+        }

@@ -1,0 +1,128 @@
+"""Layers that read a vertex's neighbourhood as a sequence: the spiral of `src.geometry.spirals`.
+
+Both take features [V, C] and spirals [V, N] of vertex indices, -1 where a sequence has ended, and
+optionally metric information [V, N, 2] (see `metric_features`); both give [V, out_features].
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+METRIC_FEATURES = 2  # distance and angle
+
+
+def metric_features(vertices: Tensor, spirals: Tensor, unit: Tensor | float) -> Tensor:
+    """The metric information of Lim et al. 2018 ("++"): distance and angle of each element.
+
+    For element c of the spiral around a, with b the element before it: |c - a| / unit, and the
+    angle at a between b and c in radians. The angle of the centre and of the first neighbour is 0,
+    and so is everything where the sequence has ended.
+
+    vertices: float [V, 3]. spirals: int64 [V, N]. unit: the length to divide by, in the vertices'
+    unit; it should follow the shape's size and not its tessellation. Returns float [V, N, 2].
+    """
+    ended = spirals < 0
+    rays = F.embedding(spirals.clamp(min=0), vertices) - vertices[:, None]
+    lengths = rays.norm(dim=2)
+    angles = torch.zeros_like(lengths)
+    before, here = rays[:, 1:-1], rays[:, 2:]
+    # atan2 of the sine and the cosine stays exact where acos loses half its digits
+    angles[:, 2:] = torch.atan2(
+        torch.linalg.cross(before, here).norm(dim=2), (before * here).sum(dim=2)
+    )
+    features = torch.stack([lengths / unit, angles], dim=2)
+    return features.masked_fill_(ended[..., None], 0.0)
+
+
+def gather(features: Tensor, spirals: Tensor) -> Tensor:
+    """features[spirals], [V, N, C], with zeros where a spiral has ended (-1)."""
+    zero = features.new_zeros(1, features.shape[1])
+    rows = spirals.where(spirals >= 0, len(features))
+    return torch.cat([features, zero]).index_select(0, rows.reshape(-1)).view(*spirals.shape, -1)
+
+
+class SpiralLinear(nn.Module):
+    """One linear map of the whole sequence of fixed length (the FCS layer of Lim et al. 2018).
+
+    out_features * (length * (in_features + 2 if metric)) weights and out_features biases.
+    """
+
+    def __init__(self, in_features: int, out_features: int, length: int, metric: bool = False):
+        super().__init__()
+        self.length = length
+        self.linear = nn.Linear(length * in_features, out_features)
+        self.metric = (
+            nn.Linear(length * METRIC_FEATURES, out_features, bias=False) if metric else None
+        )
+        fan_in = length * (in_features + METRIC_FEATURES * metric)
+        for layer in filter(None, (self.linear, self.metric)):
+            _glorot(layer.weight, fan_in, out_features)
+        nn.init.zeros_(self.linear.bias)
+
+    def forward(self, features: Tensor, spirals: Tensor, metric: Tensor | None = None) -> Tensor:
+        if spirals.shape[1] != self.length:
+            raise ValueError(f"spirals must have length {self.length}, got {spirals.shape[1]}")
+        out = self.linear(gather(features, spirals).flatten(1))
+        return out if self.metric is None else out + self.metric(metric.flatten(1))
+
+
+class SpiralLSTM(nn.Module):
+    """An LSTM along the sequence; its output is the hidden state at the last real element.
+
+    Sequences may differ in length (-1 from where one has ended; every one has an element).
+    Gates in the order input, forget, cell, output, with one bias each:
+    4 out_features (in_features + 2 if metric + out_features + 1) parameters.
+    """
+
+    def __init__(self, in_features: int, out_features: int, metric: bool = False):
+        super().__init__()
+        gates = 4 * out_features
+        self.input = nn.Linear(in_features, gates)
+        self.metric = nn.Linear(METRIC_FEATURES, gates, bias=False) if metric else None
+        self.hidden = nn.Linear(out_features, gates, bias=False)
+        fan_in = in_features + METRIC_FEATURES * metric + out_features
+        for layer in filter(None, (self.input, self.metric, self.hidden)):
+            _glorot(layer.weight, fan_in, gates)
+        nn.init.zeros_(self.input.bias)
+        nn.init.ones_(self.input.bias[out_features : 2 * out_features])  # remember, to begin with
+
+    def forward(self, features: Tensor, spirals: Tensor, metric: Tensor | None = None) -> Tensor:
+        # The input's share of the gates depends on the element alone, not on the sequence it
+        # stands in: V products serve all V N elements.
+        projected = self.input(features)
+        ended = spirals < 0
+        any_ended = bool(ended.any())
+        rows = spirals.clamp(min=0)
+        hidden = cell = None
+        for step in range(spirals.shape[1]):
+            gates = projected.index_select(0, rows[:, step])
+            if self.metric is not None:
+                gates = gates + self.metric(metric[:, step])
+            if hidden is not None:
+                gates = gates + self.hidden(hidden)
+            i, f, g, o = gates.chunk(4, dim=1)
+            new_cell = torch.sigmoid(i) * torch.tanh(g)
+            if cell is not None:
+                new_cell = new_cell + torch.sigmoid(f) * cell
+            new_hidden = torch.sigmoid(o) * torch.tanh(new_cell)
+            if any_ended and hidden is not None:
+                keep = ended[:, step, None]
+                new_hidden, new_cell = hidden.where(keep, new_hidden), cell.where(keep, new_cell)
+            hidden, cell = new_hidden, new_cell
+        return hidden
+
+
+def _glorot(weight: Tensor, fan_in: int, fan_out: int) -> None:
+    """Glorot and Bengio's (2010) uniform weights, for a block of a larger matrix too."""
+    bound = (6.0 / (fan_in + fan_out)) ** 0.5
+    nn.init.uniform_(weight, -bound, bound)
+
+
+def dense(in_features: int, out_features: int) -> nn.Linear:
+    """A fully connected layer, on each vertex alone, initialised like the others."""
+    layer = nn.Linear(in_features, out_features)
+    nn.init.xavier_uniform_(layer.weight)
+    nn.init.zeros_(layer.bias)
+    return layer

@@ -1,0 +1,73 @@
+"""Softmax cross-entropy over a last linear layer, without ever holding all its scores."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+ROWS = 512  # scores of 512 vertices at a time stay in a processor's cache
+
+
+def linear_cross_entropy(x: Tensor, weight: Tensor, bias: Tensor, labels: Tensor) -> Tensor:
+    """mean over v of -log softmax(x[v] weight^T + bias)[labels[v]], as a scalar.
+
+    x: float [V, C]. weight: float [K, C]. bias: float [K]. labels: int64 [V].
+    The same as F.cross_entropy(F.linear(x, weight, bias), labels). Gradients are formed chunk by
+    chunk while the scores are there, so memory is that of ROWS rows. Under autocast the products
+    are in its dtype; the sums are in float32 all the same. Can't be differentiated twice.
+    """
+    return _LinearCrossEntropy.apply(x, weight, bias, labels)
+
+
+class _LinearCrossEntropy(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx, x, weight, bias, labels):
+        device = x.device.type
+        if torch.is_autocast_enabled(device):
+            product = torch.get_autocast_dtype(device)
+        else:
+            product = weight.dtype
+        x_low, weight_low = x.detach().to(product), weight.detach().to(product)
+        total = torch.promote_types(product, torch.float32)  # of sums over rows
+        grad_x = torch.empty_like(x_low)
+        grad_weight = torch.zeros(weight.shape, dtype=total, device=weight.device)
+        grad_bias = torch.zeros(bias.shape, dtype=total, device=bias.device)
+        loss = torch.zeros((), dtype=total, device=x.device)
+        wants_gradient = any(ctx.needs_input_grad)
+        with torch.autocast(device, enabled=False):
+            for start in range(0, len(x), ROWS):
+                rows = slice(start, start + ROWS)
+                label = labels[rows, None]
+                scores = (x_low[rows] @ weight_low.T).to(total).add_(bias.detach())
+                scores -= scores.amax(dim=1, keepdim=True)
+                right = scores.gather(1, label)
+                sums = scores.exp_().sum(dim=1, keepdim=True)
+                loss += (sums.log() - right).sum()
+                if not wants_gradient:
+                    continue
+                scores /= sums * len(x)  # now the gradient by the scores, but for the label's
+                scores.scatter_add_(1, label, torch.full_like(right, -1.0 / len(x)))
+                grad_bias += scores.sum(dim=0)
+                grad = scores.to(product)
+                torch.mm(grad, weight_low, out=grad_x[rows])
+                if total == product:
+                    grad_weight.addmm_(grad.T, x_low[rows])
+                else:
+                    grad_weight += grad.T @ x_low[rows]
+        ctx.save_for_backward(
+            grad_x.to(x.dtype), grad_weight.to(weight.dtype), grad_bias.to(bias.dtype)
+        )
+        return loss / len(x)
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx, grad):
+        return (*(grad * g.to(grad.dtype) if g.dtype != grad.dtype else g * grad
+                  for g in ctx.saved_tensors), None)  # fmt: skip
+
+
+@torch.no_grad()
+def predict(x: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
+    """int64 [V]: the class with the largest score x weight^T + bias; arguments as above."""
+    return torch.cat([(x[i : i + ROWS] @ weight.T + bias).argmax(dim=1)
+                      for i in range(0, len(x), ROWS)])  # fmt: skip
