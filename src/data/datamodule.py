@@ -13,7 +13,7 @@ from tqdm import tqdm
 
 from src.data.preprocessing import Recipe, descriptor_task, load_task, run_tasks, spiral_task
 from src.data.reference import ReferenceDistances
-from src.data.shapes import SPLITS, Shape, ShapeSet
+from src.data.shapes import SPLITS, DataError, Shape, ShapeSet
 from src.data.store import Store, digest
 
 log = logging.getLogger(__name__)
@@ -136,6 +136,9 @@ class CorrespondenceData(L.LightningDataModule):
 
     def prepare(self, wanted: list[str] | tuple[str, ...] = SPLITS) -> None:
         """Read the meshes of those splits, compute what is not on disk yet, and load it."""
+        for split in wanted:
+            if not self.shapes.names[split]:
+                raise DataError(f"no mesh to {split}: the data set's split has none")
         names = [(split, name) for split in wanted for name in self.shapes.names[split]]
         shapes, tasks = [], []
         for _, name in tqdm(names, desc="Meshes", unit="mesh", delay=1.0):

@@ -12,7 +12,7 @@ from tqdm import tqdm
 
 from src.data.store import Arrays, Store, code_version, digest
 from src.geometry import connectivity, mesh, shot, spirals
-from src.geometry.mesh import Mesh
+from src.geometry.mesh import Mesh, MeshError
 
 
 @dataclass(frozen=True)
@@ -55,8 +55,12 @@ def spiral_task(mesh_: Mesh, recipe: Recipe) -> Task:
 
 
 def _descriptors(mesh_: Mesh, radius: float, bins: int) -> Arrays:
+    if mesh_.area == 0:
+        raise MeshError(f"{mesh_.name}: no surface area, so there is no scale to describe it at")
     length = radius * np.sqrt(mesh_.area)
-    features = shot.shot_descriptors(mesh_.vertices, mesh_.vertex_normals, length, bins)
+    # far from the origin float32, in which SHOT is defined, would have no digits left
+    centred = mesh_.vertices - mesh_.vertices.mean(axis=0)
+    features = shot.shot_descriptors(centred, mesh_.vertex_normals, length, bins)
     undefined = np.isnan(features).any(axis=1)
     features[undefined] = 0.0
     return {"features": features, "undefined": np.array(undefined.sum())}

@@ -24,7 +24,8 @@ def metric_features(vertices: Tensor, spirals: Tensor, unit: Tensor | float) -> 
     unit; it should follow the shape's size and not its tessellation. Returns float [V, N, 2].
     """
     ended = spirals < 0
-    rays = F.embedding(spirals.clamp(min=0), vertices) - vertices[:, None]
+    points = F.embedding(spirals.clamp(min=0), vertices)
+    rays = points - points[:, :1]
     lengths = rays.norm(dim=2)
     angles = torch.zeros_like(lengths)
     before, here = rays[:, 1:-1], rays[:, 2:]

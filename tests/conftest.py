@@ -1,0 +1,51 @@
+"""A toy data set: small closed surfaces, deformed, that a network learns in seconds."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+from tests.meshes import bumpy_sphere
+
+from src.geometry.mesh import Mesh
+
+TOY_SPLIT = {"train": 6, "val": 2, "test": 2}
+
+
+def toy_shapes() -> dict[str, Mesh]:
+    """A template of 162 vertices, and ten smooth deformations of it, by file name."""
+    template = bumpy_sphere(7, subdivisions=2, bump=0.6)
+    shapes = {"template.ply": template}
+    for split, count in TOY_SPLIT.items():
+        for i in range(count):
+            rng = np.random.default_rng([len(split), i])
+            x = template.vertices
+            bend = 0.05 * np.sin(x @ rng.normal(size=(3, 3)) + rng.uniform(0, 6, 3))
+            shapes[f"{split}/{i}.ply"] = Mesh(x + bend, template.faces)
+    return shapes
+
+
+@pytest.fixture(scope="session")
+def toy(tmp_path_factory) -> Path:
+    """The folder of the toy data set, in the layout of `data=folder`."""
+    root = tmp_path_factory.mktemp("toy")
+    for name, mesh in toy_shapes().items():
+        path = root / name
+        path.parent.mkdir(exist_ok=True)
+        trimesh.Trimesh(mesh.vertices, mesh.faces, process=False).export(path)
+    return root
+
+
+@pytest.fixture(scope="session")
+def toy_overrides(toy, tmp_path_factory) -> list[str]:
+    """The command line that trains a small network on the toy data set."""
+    cache = tmp_path_factory.mktemp("cache")
+    return [
+        "data=folder", f"data.root={toy}", "data.template=template.ply", "data.labels=identity",
+        "data.train=[train/*.ply]", "data.val=[val/*.ply]", "data.test=[test/*.ply]",
+        f"data.cache_dir={cache}", "data.shot.radius=0.3", "data.shot.bins=4", "data.workers=1",
+        "model.channels=[12,14,16]", "seq_len=8", "trainer.threads=1", "picture=false",
+        "optim.epochs=4",
+    ]  # fmt: skip

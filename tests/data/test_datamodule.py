@@ -1,0 +1,281 @@
+"""What a network is served: the right tensors, fresh spirals, and nothing of the numbering."""
+
+import logging
+
+import lightning as L
+import numpy as np
+import pytest
+import torch
+
+from src.data import preprocessing
+from src.data.datamodule import CorrespondenceData, EpochSampler, draw_spirals
+from src.data.preprocessing import Recipe, descriptor_task, spiral_task
+from src.data.shapes import DataError, Shape, ShapeSet
+from src.data.store import Store
+from src.geometry.mesh import Mesh, MeshError
+from src.geometry.shot import shot_descriptors
+from src.geometry.spirals import spiral_table
+from tests.conftest import TOY_SPLIT, toy_shapes
+from tests.meshes import bumpy_sphere, lattice, punctured, union
+
+RECIPE = Recipe(shot_radius=0.3, shot_bins=4, seq_len=8)
+
+
+class Toy(ShapeSet):
+    def __init__(self, shapes=None):
+        self.shapes = shapes or toy_shapes()
+        self.template = self.shapes["template.ply"]
+        self.names = {split: [n for n in self.shapes if n.startswith(split)] for split in TOY_SPLIT}
+
+    def load(self, name):
+        mesh = self.shapes[name]
+        return Shape(Mesh(mesh.vertices, mesh.faces, name), np.arange(162), 162)
+
+
+def serve(store, recipe=RECIPE, seed=0, shapes=None, **options):
+    data = CorrespondenceData(Toy(shapes), recipe, store, seed, workers=1, **options)
+    data.prepare()
+    return data
+
+
+@pytest.fixture
+def store(tmp_path):
+    return Store(tmp_path)
+
+
+class Recorder(L.LightningModule):
+    """Notes what it is served."""
+
+    def __init__(self):
+        super().__init__()
+        self.weight = torch.nn.Parameter(torch.zeros(()))
+        self.seen = {"train": [], "val": []}
+
+    def note(self, split, batch):
+        self.seen[split].append((batch["index"], batch["spirals"].clone(), self.current_epoch))
+
+    def training_step(self, batch, i):
+        self.note("train", batch)
+        return self.weight * batch["features"].sum()
+
+    def validation_step(self, batch, i):
+        self.note("val", batch)
+
+    def configure_optimizers(self):
+        return torch.optim.SGD(self.parameters(), lr=0.1)
+
+
+def served(data, epochs=2):
+    module = Recorder()
+    trainer = L.Trainer(max_epochs=epochs, accelerator="cpu", logger=False, barebones=True)
+    trainer.fit(module, datamodule=data)
+    return module.seen
+
+
+def test_items_hold_what_they_say(store):
+    data = serve(store)
+    assert {s: len(d) for s, d in data.datasets.items()} == TOY_SPLIT
+    item = data.datasets["train"][1]
+    mesh = data.shapes.load("train/1.ply").mesh
+    centred = mesh.vertices - mesh.vertices.mean(0)
+    expected = shot_descriptors(centred, mesh.vertex_normals, 0.3 * np.sqrt(mesh.area), 4)
+    np.testing.assert_array_equal(item["features"], expected)
+    table = spiral_table(mesh, 8)
+    np.testing.assert_array_equal(item["sequences"], table.sequences)
+    np.testing.assert_array_equal(item["first"], table.first)
+    np.testing.assert_array_equal(item["labels"], np.arange(162))
+    assert item["unit"] == pytest.approx(0.3 * np.sqrt(mesh.area)) and item["index"] == 1
+    dtypes = {name: str(t.dtype).removeprefix("torch.") for name, t in item.items() if name != "index"}
+    assert dtypes == {"features": "float32", "sequences": "int32", "first": "int64",
+                      "labels": "int64", "vertices": "float32", "unit": "float32"}  # fmt: skip
+    assert data.num_classes == 162 and data.in_features == item["features"].shape[1] == 32 * 5
+
+
+def test_meshes_of_one_connectivity_share_one_table(store):
+    data = serve(store)
+    tables = {item["sequences"].data_ptr() for d in data.datasets.values() for item in d.items}
+    assert len(tables) == 1 and len(list((store.root / "spirals").iterdir())) == 1
+
+
+def test_every_start_is_drawn_equally_often():
+    mesh = punctured(bumpy_sphere(), 0.2)
+    table = spiral_table(mesh, 4)
+    sequences, first = torch.from_numpy(table.sequences), torch.from_numpy(table.first)
+    generator = torch.Generator().manual_seed(0)
+    draws = torch.stack([draw_spirals(sequences, first, generator)[:, 1] for _ in range(600)])
+    assert draws.dtype == torch.int64
+    for v in range(len(mesh.vertices)):
+        starts = table.sequences[table.first[v] : table.first[v + 1], 1]
+        counts = np.array([(draws[:, v] == int(s)).sum() for s in starts])
+        assert counts.sum() == 600
+        assert np.abs(counts - 600 / len(starts)).max() < 6 * np.sqrt(600 / len(starts))
+
+
+def test_drawn_spirals_are_rows_of_their_vertex():
+    table = spiral_table(union(lattice(3, 3), Mesh([[0, 0, 0]], [])), 5)
+    drawn = draw_spirals(torch.from_numpy(table.sequences), torch.from_numpy(table.first))
+    for v, row in enumerate(drawn.tolist()):
+        assert row in table.sequences[table.first[v] : table.first[v + 1]].tolist()
+
+
+def test_training_draws_anew_in_every_iteration_and_validation_never(store):
+    seen = served(serve(store), epochs=3)
+    assert len(seen["train"]) == 18
+    first = {index: spirals for index, spirals, epoch in seen["train"] if epoch == 0}
+    for index, spirals, epoch in seen["train"]:
+        if epoch > 0:
+            assert (spirals[:, 1] != first[index][:, 1]).float().mean() > 0.5
+    validated = {}
+    for index, spirals, _ in seen["val"]:
+        assert torch.equal(validated.setdefault(index, spirals), spirals)
+    assert not torch.equal(validated[0], validated[1])
+    orders = [[i for i, _, e in seen["train"] if e == epoch] for epoch in range(3)]
+    assert all(sorted(order) == list(range(6)) for order in orders)
+    assert orders[0] != orders[1] or orders[1] != orders[2]
+
+
+def test_one_seed_one_run_and_another_another(store):
+    a, b, c = (served(serve(store, seed=seed))["train"] for seed in (3, 3, 4))
+    assert all(x[0] == y[0] and torch.equal(x[1], y[1]) for x, y in zip(a, b, strict=True))
+    assert any(x[0] != y[0] or not torch.equal(x[1], y[1]) for x, y in zip(a, c, strict=True))
+
+
+def test_a_sampler_that_skips_goes_on_where_it_was():
+    whole, rest = EpochSampler(10, 5), EpochSampler(10, 5, skip=4)
+    for epoch in (2, 3):
+        whole.set_epoch(epoch), rest.set_epoch(epoch)
+        skipped = 4 if epoch == 2 else 0
+        assert list(rest) == list(whole)[skipped:]
+
+
+# -------------------------------------------------------------------------------- the numbering
+
+
+def test_renumbered_meshes_give_renumbered_tensors(store):
+    """Nothing in the chain depends on vertex numbers: descriptors, labels and spirals move along."""
+    plain, shuffled = serve(store), serve(store, shuffle_vertices=True)
+    for a, b in zip(plain.datasets["train"].items, shuffled.datasets["train"].items, strict=True):
+        order = b["labels"]  # vertex i of the shuffled mesh is vertex order[i] of the plain one
+        assert not torch.equal(order, a["labels"]) and torch.equal(order.sort()[0], a["labels"])
+        torch.testing.assert_close(b["vertices"], a["vertices"][order])
+        # sums run in another order, and a vote on the border of a cell may fall to the other side
+        rows = (b["features"] - a["features"][order]).abs().amax(1)
+        assert (rows < 1e-4).float().mean() > 0.99
+        for v in range(0, 162, 5):
+            old = int(order[v])
+            ours = order[b["sequences"][b["first"][v] : b["first"][v + 1]].long()].tolist()
+            theirs = a["sequences"][a["first"][old] : a["first"][old + 1]].tolist()
+            assert sorted(ours) == sorted(theirs)
+
+
+def test_every_mesh_is_shuffled_in_its_own_way_and_the_same_way_again(store):
+    once, twice = (serve(store, shuffle_vertices=True).datasets["train"].items for _ in range(2))
+    assert all(torch.equal(a["labels"], b["labels"]) for a, b in zip(once, twice, strict=True))
+    assert not torch.equal(once[0]["labels"], once[1]["labels"])
+
+
+# ------------------------------------------------------------------------------------ the cache
+
+
+def test_a_second_run_computes_nothing(store, monkeypatch):
+    serve(store)
+    monkeypatch.setattr(preprocessing, "_descriptors", None)
+    monkeypatch.setattr(preprocessing, "_spirals", None)
+    serve(store)
+
+
+@pytest.mark.parametrize(
+    "change", [{"shot_radius": 0.31}, {"shot_bins": 5}, {"seq_len": 9}, {"seq_len": None, "rings": 1}]
+)
+def test_keys_depend_on_every_parameter(change):
+    mesh = bumpy_sphere()
+    other = Recipe(**{**RECIPE.__dict__, **change})
+    keys = [task(mesh, RECIPE).key == task(mesh, other).key
+            for task in (descriptor_task, spiral_task)]  # fmt: skip
+    assert sorted(keys) == [False, True]
+
+
+def test_keys_depend_on_content_and_code_and_not_on_the_name(monkeypatch):
+    mesh = bumpy_sphere()
+    moved = Mesh(mesh.vertices + 1e-9, mesh.faces)
+    named = Mesh(mesh.vertices, mesh.faces, "another")
+    assert descriptor_task(named, RECIPE).key == descriptor_task(mesh, RECIPE).key
+    assert descriptor_task(moved, RECIPE).key != descriptor_task(mesh, RECIPE).key
+    assert spiral_task(moved, RECIPE).key == spiral_task(mesh, RECIPE).key
+    before = [task(mesh, RECIPE).key for task in (descriptor_task, spiral_task)]
+    monkeypatch.setattr(preprocessing, "code_version", lambda *modules: "another")
+    after = [task(mesh, RECIPE).key for task in (descriptor_task, spiral_task)]
+    assert all(a != b for a, b in zip(before, after, strict=True))
+
+
+def test_a_damaged_result_is_computed_again(store, caplog):
+    before = serve(store).datasets["val"][0]["features"]
+    for path in (store.root / "shot").iterdir():
+        path.write_bytes(path.read_bytes()[:1000])
+    with caplog.at_level(logging.WARNING):
+        assert torch.equal(serve(store).datasets["val"][0]["features"], before)
+    assert "computing it again" in caplog.text
+
+
+def test_the_pool_computes_what_one_process_computes(tmp_path, monkeypatch):
+    alone = serve(Store(tmp_path / "alone"))
+    clock = iter(range(0, 10**6, 100))
+    monkeypatch.setattr(preprocessing.time, "perf_counter", lambda: next(clock))  # "this is slow"
+    data = CorrespondenceData(Toy(), RECIPE, Store(tmp_path / "pool"), workers=2)
+    started = []
+    run_in_pool = preprocessing._run_in_pool
+    monkeypatch.setattr(
+        preprocessing, "_run_in_pool", lambda *a: started.append(len(a[0])) or run_in_pool(*a)
+    )
+    data.prepare()
+    assert started == [8]
+    for split in TOY_SPLIT:
+        for a, b in zip(data.datasets[split].items, alone.datasets[split].items, strict=True):
+            assert torch.equal(a["features"], b["features"])
+
+
+# ------------------------------------------------------------------------------------- bad input
+
+
+def test_undefined_descriptors_become_zeros_and_are_counted_once(store, caplog):
+    shapes = toy_shapes()
+    mesh = shapes["train/0.ply"]
+    far = mesh.vertices.copy()
+    lost = np.flatnonzero((mesh.faces == 0).any(1))
+    far[0] += 50  # so far from all others that its neighbourhood is empty
+    shapes["train/0.ply"] = Mesh(far, np.delete(mesh.faces, lost, axis=0))
+    with caplog.at_level(logging.WARNING):
+        data = serve(store, shapes=shapes)
+    features = data.datasets["train"].items[0]["features"]
+    assert torch.isfinite(features).all() and (features[0] == 0).all()
+    assert caplog.text.count("no descriptor at 1 of 162 vertices") == 1
+    assert "train/0.ply" in caplog.text
+
+
+def test_a_mesh_without_area_is_one_message(store):
+    shapes = toy_shapes()
+    mesh = shapes["val/0.ply"]
+    shapes["val/0.ply"] = Mesh(np.zeros_like(mesh.vertices), mesh.faces)
+    with pytest.raises(MeshError, match=r"val/0\.ply: no surface area"):
+        serve(store, shapes=shapes)
+
+
+def test_a_split_without_meshes_is_one_message(store):
+    shapes = {name: mesh for name, mesh in toy_shapes().items() if not name.startswith("val")}
+    with pytest.raises(DataError, match="no mesh to val"):
+        serve(store, shapes=shapes)
+
+
+def test_a_mesh_far_from_the_origin_has_the_same_descriptors(store):
+    mesh = bumpy_sphere()
+    near = preprocessing._descriptors(mesh, 0.3, 4)["features"]
+    far = preprocessing._descriptors(Mesh(mesh.vertices + 1e4, mesh.faces), 0.3, 4)["features"]
+    assert (np.abs(far - near).max(axis=1) < 1e-3).mean() > 0.98
+
+
+def test_labels_outside_the_template_are_refused():
+    mesh = lattice(3, 3)
+    with pytest.raises(DataError, match=r"1 labels outside 0\.\.8.*vertex 4 has 9"):
+        Shape(mesh, [0, 1, 2, 3, 9, 5, 6, 7, 8], 9)
+    with pytest.raises(DataError, match=r"9 vertices but labels \(8,\)"):
+        Shape(mesh, np.arange(8), 9)

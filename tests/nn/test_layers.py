@@ -1,0 +1,143 @@
+"""The spiral layers against the plain operators of PyTorch that they stand for."""
+
+import numpy as np
+import pytest
+import torch
+from torch import nn
+from torch.nn import functional as F
+
+from src.nn.layers import SpiralLinear, SpiralLSTM, gather, metric_features
+
+def sequences(vertices, length, padded, seed=0):
+    rng = torch.Generator().manual_seed(seed)
+    shift = torch.stack([1 + torch.randperm(vertices - 1, generator=rng)[: length - 1]
+                         for _ in range(vertices)])  # fmt: skip
+    centre = torch.arange(vertices)[:, None]
+    spirals = torch.cat([centre, (centre + shift) % vertices], dim=1)
+    if padded:
+        ends = torch.randint(1, length + 1, (vertices,), generator=rng)
+        ends[:2] = torch.tensor([1, length])
+        spirals[torch.arange(length) >= ends[:, None]] = -1
+    return spirals
+
+
+def metric_by_hand(vertices, spirals, unit):
+    out = np.zeros((*spirals.shape, 2))
+    for v, spiral in enumerate(spirals):
+        a = vertices[spiral[0]]
+        for i, c in enumerate(spiral):
+            if c < 0:
+                continue
+            out[v, i, 0] = np.linalg.norm(vertices[c] - a) / unit
+            if i >= 2:
+                b, c = vertices[spiral[i - 1]] - a, vertices[c] - a
+                cosine = b @ c / np.linalg.norm(b) / np.linalg.norm(c)
+                out[v, i, 1] = np.arccos(np.clip(cosine, -1, 1))
+    return out
+
+
+def test_metric_features_are_distance_and_angle():
+    vertices = torch.randn(12, 3, dtype=torch.float64)
+    spirals = sequences(12, 7, padded=True)
+    features = metric_features(vertices, spirals, 0.7)
+    expected = metric_by_hand(vertices.numpy(), spirals.numpy(), 0.7)
+    np.testing.assert_allclose(features, expected, atol=1e-10)
+
+
+def test_metric_features_do_not_depend_on_place_turn_and_scale():
+    vertices = torch.randn(20, 3, dtype=torch.float64)
+    spirals = sequences(20, 9, padded=False)
+    turn, _ = torch.linalg.qr(torch.randn(3, 3, dtype=torch.float64))
+    moved = 1000 * vertices @ turn + 5
+    torch.testing.assert_close(
+        metric_features(vertices, spirals, 0.3), metric_features(moved, spirals, 300.0)
+    )
+
+
+def test_metric_features_of_a_right_angle():
+    vertices = torch.tensor([[0.0, 0, 0], [2, 0, 0], [0, 2, 0], [0, 4, 0]])
+    features = metric_features(vertices, torch.tensor([[0, 1, 2, 3]]), 2.0)
+    expected = [[[0, 0], [1, 0], [1, np.pi / 2], [2, 0]]]
+    torch.testing.assert_close(features, torch.tensor(expected, dtype=torch.float32))
+
+
+def test_coincident_vertices_give_finite_features():
+    vertices = torch.zeros(4, 3)
+    features = metric_features(vertices, torch.tensor([[0, 1, 2, 3]]), 1.0)
+    assert torch.isfinite(features).all()
+
+
+def test_gather_puts_zeros_where_a_spiral_has_ended():
+    features = torch.randn(6, 3)
+    spirals = torch.tensor([[0, 5, 2], [1, -1, -1]])
+    out = gather(features, spirals)
+    torch.testing.assert_close(out[0], features[[0, 5, 2]])
+    assert (out[1, 1:] == 0).all()
+
+
+@pytest.mark.parametrize("metric", [False, True])
+@pytest.mark.parametrize("padded", [False, True])
+def test_spiral_linear_is_one_linear_map_of_the_sequence(metric, padded):
+    layer = SpiralLinear(5, 4, 6, metric).double()
+    features = torch.randn(11, 5, dtype=torch.float64)
+    spirals = sequences(11, 6, padded)
+    extra = torch.randn(11, 6, 2, dtype=torch.float64) if metric else None
+    out = layer(features, spirals, extra)
+    for v in range(11):
+        expected = layer.linear.bias.clone()
+        for i, c in enumerate(spirals[v].tolist()):
+            if c >= 0:
+                expected += layer.linear.weight[:, 5 * i : 5 * i + 5] @ features[c]
+            if metric:
+                expected += layer.metric.weight[:, 2 * i : 2 * i + 2] @ extra[v, i]
+        torch.testing.assert_close(out[v], expected)
+
+
+def test_spiral_linear_refuses_another_length():
+    with pytest.raises(ValueError, match="length 6, got 5"):
+        SpiralLinear(5, 4, 6)(torch.randn(9, 5), sequences(9, 5, False))
+
+
+def reference_lstm(layer: SpiralLSTM, metric: bool) -> nn.LSTM:
+    """torch.nn.LSTM with the layer's weights; its second bias is 0."""
+    hidden = layer.hidden.in_features
+    lstm = nn.LSTM(layer.input.in_features + 2 * metric, hidden, batch_first=True).double()
+    weight = [layer.input.weight, layer.metric.weight] if metric else [layer.input.weight]
+    with torch.no_grad():
+        lstm.weight_ih_l0.copy_(torch.cat(weight, dim=1))
+        lstm.weight_hh_l0.copy_(layer.hidden.weight)
+        lstm.bias_ih_l0.copy_(layer.input.bias)
+        lstm.bias_hh_l0.zero_()
+    return lstm
+
+
+@pytest.mark.parametrize("metric", [False, True])
+@pytest.mark.parametrize("padded", [False, True])
+def test_spiral_lstm_is_the_last_real_output_of_an_lstm(metric, padded):
+    layer = SpiralLSTM(5, 7, metric).double()
+    features = torch.randn(13, 5, dtype=torch.float64, requires_grad=True)
+    spirals = sequences(13, 6, padded)
+    extra = torch.randn(13, 6, 2, dtype=torch.float64) if metric else None
+    out = layer(features, spirals, extra)
+
+    x = gather(features, spirals)
+    if metric:
+        x = torch.cat([x, extra], dim=2)
+    lengths = (spirals >= 0).sum(1)
+    packed = nn.utils.rnn.pack_padded_sequence(x, lengths, batch_first=True, enforce_sorted=False)
+    lstm = reference_lstm(layer, metric)
+    expected = lstm(packed)[1][0][0]
+    torch.testing.assert_close(out, expected, rtol=0, atol=1e-12)
+
+    upstream = torch.randn_like(out)
+    grad = torch.autograd.grad(out, [features, layer.hidden.weight, layer.input.bias], upstream)
+    same = torch.autograd.grad(expected, [features, lstm.weight_hh_l0, lstm.bias_ih_l0], upstream)
+    for a, b in zip(grad, same, strict=True):
+        torch.testing.assert_close(a, b, rtol=0, atol=1e-11)
+
+
+def test_what_stands_in_the_padding_does_not_matter():
+    layer = SpiralLSTM(3, 4)
+    features, spirals = torch.randn(9, 3), sequences(9, 5, padded=True)
+    longer = F.pad(spirals, (0, 4), value=-1)
+    torch.testing.assert_close(layer(features, spirals), layer(features, longer))

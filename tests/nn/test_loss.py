@@ -1,0 +1,69 @@
+"""The chunked last layer against linear + cross-entropy."""
+
+import pytest
+import torch
+from torch.nn import functional as F
+
+from src.nn import loss as module
+from src.nn.loss import linear_cross_entropy, predict
+
+
+@pytest.fixture
+def layer():
+    torch.manual_seed(0)
+    x, weight, bias = (torch.randn(*shape, dtype=torch.float64, requires_grad=True)
+                       for shape in ((23, 5), (17, 5), (17,)))  # fmt: skip
+    return x, weight, bias, torch.randint(0, 17, (23,))
+
+
+@pytest.mark.parametrize("rows", [1, 7, 23, 512])
+def test_value_and_gradients_are_those_of_linear_and_cross_entropy(layer, rows, monkeypatch):
+    monkeypatch.setattr(module, "ROWS", rows)
+    x, weight, bias, labels = layer
+    loss = linear_cross_entropy(*layer)
+    plain = F.cross_entropy(F.linear(x, weight, bias), labels)
+    torch.testing.assert_close(loss, plain, rtol=0, atol=1e-12)
+    for a, b in zip(torch.autograd.grad(3 * loss, (x, weight, bias)),
+                    torch.autograd.grad(3 * plain, (x, weight, bias)), strict=True):  # fmt: skip
+        torch.testing.assert_close(a, b, rtol=0, atol=1e-12)
+
+
+def test_gradients_are_the_limits_of_differences(layer):
+    x, weight, bias, labels = layer
+    assert torch.autograd.gradcheck(lambda *a: linear_cross_entropy(*a, labels), (x, weight, bias))
+
+
+def test_very_large_scores_overflow_nothing(layer):
+    x, weight, bias, labels = layer
+    loss = linear_cross_entropy((1e4 * x).float(), weight.float(), bias.float(), labels)
+    plain = F.cross_entropy(F.linear(1e4 * x, weight, bias), labels)
+    torch.testing.assert_close(loss.double(), plain, rtol=1e-5, atol=0)
+
+
+def test_under_autocast_the_products_are_in_bf16_and_the_sums_are_not(layer):
+    x, weight, bias, labels = (t.detach().float() if t.is_floating_point() else t for t in layer)
+    x.requires_grad_(), weight.requires_grad_()
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        loss = linear_cross_entropy(x, weight, bias, labels)
+    plain = F.cross_entropy(F.linear(x, weight, bias), labels)
+    assert loss.dtype == torch.float32
+    torch.testing.assert_close(loss, plain, rtol=2e-2, atol=0)
+    assert loss != plain
+    for a, b in zip(torch.autograd.grad(loss, (x, weight)),
+                    torch.autograd.grad(plain, (x, weight)), strict=True):  # fmt: skip
+        assert a.dtype == torch.float32
+        torch.testing.assert_close(a, b, rtol=0, atol=2e-2)
+
+
+def test_without_gradients_the_value_is_the_same(layer):
+    with torch.no_grad():
+        torch.testing.assert_close(
+            linear_cross_entropy(*layer), F.cross_entropy(F.linear(*layer[:3]), layer[3])
+        )
+
+
+@pytest.mark.parametrize("rows", [4, 512])
+def test_predict_is_the_argmax(layer, rows, monkeypatch):
+    monkeypatch.setattr(module, "ROWS", rows)
+    x, weight, bias, _ = layer
+    torch.testing.assert_close(predict(x, weight, bias), F.linear(x, weight, bias).argmax(1))

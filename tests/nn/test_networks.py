@@ -1,0 +1,99 @@
+"""The networks of Lim et al. 2018: the sizes of table 1, and what they may depend on."""
+
+import pytest
+import torch
+
+from src.nn.networks import FCSNet, LSTMNet
+
+
+def parameters(net):
+    return sum(p.numel() for p in net.parameters())
+
+
+def test_lstm_net_has_the_parameters_of_table_1():
+    assert parameters(LSTMNet(544, 6890)) == 2_675_706
+
+
+@pytest.mark.parametrize("length, count", [(15, 2_530_356), (20, 2_763_356), (30, 3_229_356)])
+def test_fcs_net_has_the_parameters_of_table_1(length, count):
+    assert parameters(FCSNet(544, 6890, length)) == count
+
+
+def test_metric_information_adds_two_channels_to_the_layers_that_take_it():
+    plain, n = parameters(FCSNet(544, 6890, 20)), 20
+    assert parameters(FCSNet(544, 6890, n, metric=True)) == plain + 2 * n * (100 + 150 + 200)
+    first = FCSNet(544, 6890, n, metric=True, metric_layers="first")
+    assert parameters(first) == plain + 2 * n * 100
+    lstm = parameters(LSTMNet(544, 6890))
+    assert parameters(LSTMNet(544, 6890, metric=True)) == lstm + 2 * 4 * (150 + 200 + 250)
+
+
+def make(name, metric=False, **options):
+    torch.manual_seed(0)
+    if name == "fcs":
+        return FCSNet(10, 21, 6, channels=[5, 6, 7], metric=metric, **options)
+    return LSTMNet(10, 21, channels=[5, 6, 7], metric=metric, **options)
+
+
+@pytest.fixture
+def batch():
+    torch.manual_seed(1)
+    spirals = torch.stack([torch.randperm(30)[:6] for _ in range(30)])
+    return torch.randn(30, 10), spirals, torch.rand(30, 6, 2)
+
+
+@pytest.mark.parametrize("name", ["fcs", "lstm"])
+@pytest.mark.parametrize("metric", [False, True])
+def test_scores_have_one_column_per_template_vertex(name, metric, batch):
+    features, spirals, extra = batch
+    scores = make(name, metric)(features, spirals, extra if metric else None)
+    assert scores.shape == (30, 21) and torch.isfinite(scores).all()
+
+
+@pytest.mark.parametrize("name", ["fcs", "lstm"])
+def test_renumbering_vertices_renumbers_the_scores(name, batch):
+    features, spirals, _ = batch
+    net = make(name).eval().double()
+    order = torch.randperm(30)
+    inverse = torch.argsort(order)
+    renumbered = net(features[order].double(), inverse[spirals[order]])
+    torch.testing.assert_close(renumbered, net(features.double(), spirals)[order])
+
+
+@pytest.mark.parametrize("name", ["fcs", "lstm"])
+def test_metric_information_must_be_given_exactly_where_it_is_expected(name, batch):
+    features, spirals, extra = batch
+    with pytest.raises(ValueError, match="with metric"):
+        make(name, metric=True)(features, spirals)
+    with pytest.raises(ValueError, match="without metric"):
+        make(name)(features, spirals, extra)
+
+
+@pytest.mark.parametrize("name", ["fcs", "lstm"])
+@pytest.mark.parametrize("place, layers", [("all", 3), ("first", 1)])
+def test_metric_information_reaches_the_layers_it_should(name, place, layers, batch):
+    features, spirals, extra = batch
+    net = make(name, metric=True, metric_layers=place)
+    net(features, spirals, extra).sum().backward()
+    reached = [layer.metric is not None and bool(layer.metric.weight.grad.any())
+               for layer in net.spiral_layers]  # fmt: skip
+    assert reached == [True] * layers + [False] * (3 - layers)
+
+
+def test_metric_layers_is_a_closed_list():
+    with pytest.raises(ValueError, match="metric_layers must be one of"):
+        make("fcs", metric=True, metric_layers="some")
+
+
+def test_dropout_is_off_in_evaluation_and_on_in_training(batch):
+    features, spirals, _ = batch
+    net = make("fcs")
+    assert not torch.equal(net(features, spirals), net(features, spirals))
+    net.eval()
+    assert torch.equal(net(features, spirals), net(features, spirals))
+
+
+def test_the_forget_gate_begins_open():
+    layer = LSTMNet(10, 21).spiral_layers[0]
+    i, f, g, o = layer.input.bias.chunk(4)
+    assert (f == 1).all() and not any(gate.any() for gate in (i, g, o))
