@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import os
+import re
 import signal
 import sys
 from collections.abc import Callable
 from pathlib import Path
 
 import hydra
+from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.errors import HydraException
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
@@ -29,7 +32,7 @@ log = logging.getLogger("src")
 class Stopped(BaseException):
     """Ctrl-C or SIGTERM. The message says how to go on."""
 
-    def __init__(self, signum: int, message: str = "stopped"):
+    def __init__(self, signum: int, message: str = "Stopped."):
         super().__init__(message)
         self.signum = signum
 
@@ -39,29 +42,49 @@ def run_folder(resume: str | None, new: str) -> str:
     return resume if resume and Path(resume).is_dir() else new
 
 
+def job_folder(overrides: list[str], number: int) -> str:
+    """A job's folder in a sweep, named by the settings that the sweep varies.
+
+    overrides: the job's own. Those that the command line gives one value are the same in every job.
+    """
+    parse = OverridesParser.create().parse_override
+    fixed = set()
+    for word in sys.argv[1:]:
+        with contextlib.suppress(HydraException):
+            override = parse(word)
+            if not override.is_sweep_override():
+                fixed.add(override.key_or_group)
+    varied = [o.lstrip("+") for o in overrides if parse(o).key_or_group not in fixed]
+    name = "_".join(re.sub(r"[^\w.+-]+", "-", o) for o in varied)
+    return name[:200] or str(number)
+
+
 def entry_point(name: str) -> Callable[[Callable[[DictConfig], None]], Callable[[], None]]:
     """Make `task(config)` a program with the config conf/<name>.yaml.
 
     A mistake of the user ends it with one message and exit code 1 (2 if the command line can't be
     read), Ctrl-C with 130 and SIGTERM with 143. Anything else is an error of ours and shows its
-    traceback.
+    traceback. In a sweep the jobs after a failed one still run.
     """
 
     def decorate(task: Callable[[DictConfig], None]) -> Callable[[], None]:
+        failed: list[str] = []
+
         def job(config: DictConfig) -> None:
             try:
                 task(checked(config))
             except USER_ERRORS as error:
                 log.error("error: %s", one_line(error))
-                error.said = True
-                raise
-            except Exception:
+                failed.append(one_line(error))
+            except Exception as error:
                 log.exception("error: this should not have happened")
-                raise
+                failed.append(repr(error))
 
         def main() -> None:
+            failed.clear()
             os.environ.setdefault("HYDRA_FULL_ERROR", "1")  # Hydra hands errors on: we word them
             OmegaConf.register_new_resolver("run_folder", run_folder, replace=True)
+            OmegaConf.register_new_resolver("job_folder", job_folder, replace=True)
             signal.signal(signal.SIGTERM, _stop)
             signal.signal(signal.SIGINT, _stop)
             try:
@@ -70,9 +93,10 @@ def entry_point(name: str) -> Callable[[Callable[[DictConfig], None]], Callable[
                 print(f"\n{stopped}", file=sys.stderr)
                 sys.exit(128 + stopped.signum)
             except USER_ERRORS as error:
-                if not getattr(error, "said", False):
-                    print(f"error: {one_line(error)}", file=sys.stderr)
+                print(f"error: {one_line(error)}", file=sys.stderr)
                 sys.exit(2 if isinstance(error, HydraException) else 1)
+            if failed:
+                sys.exit(1)
 
         return main
 

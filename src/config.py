@@ -154,6 +154,10 @@ def checked(config: DictConfig) -> DictConfig:
     for key, values in ONE_OF.items():
         if (value := OmegaConf.select(typed, key)) not in values:
             raise ConfigError(f"{key} must be one of {', '.join(values)}; got {value}")
+    if len(typed.model.channels) != 3 or min(typed.model.channels) < 1:
+        raise ConfigError(
+            f"model.channels must hold three numbers of at least 1; got {typed.model.channels}"
+        )
     if not 0 <= typed.model.dropout < 1:
         raise ConfigError(f"model.dropout must be in 0..1, 1 left out; got {typed.model.dropout}")
     return typed

@@ -58,6 +58,7 @@ def train(config: DictConfig, folder: Path) -> dict[str, float]:
     quiet()
     plain = OmegaConf.to_container(config)
     torch.set_num_threads(config.trainer.threads or torch.get_num_threads())
+    torch.set_flush_denormal(True)  # tiny probabilities would slow the softmax down tenfold
     store = Store(config.data.cache_dir)
     rings = config.model.get("rings")
     recipe = Recipe(config.data.shot.radius, config.data.shot.bins,
@@ -199,6 +200,7 @@ def quiet() -> None:
         ".*`isinstance.treespec, LeafSpec.` is deprecated.*",
         ".*smaller than the logging interval.*",
         ".*GPU available but not used.*",
+        ".*ended before the epoch ended and your dataloader is not resumable.*",  # ours goes on
     ):
         warnings.filterwarnings("ignore", message)
 

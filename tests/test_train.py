@@ -1,0 +1,307 @@
+"""The main program: what a run leaves behind, and that it can be repeated, stopped and continued."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from hydra import compose, initialize_config_dir
+from omegaconf import OmegaConf
+
+from src import train as program
+from src.callbacks import Speed, WholeFiles
+from src.cli import CONF, Stopped, run_folder
+from src.config import checked
+from src.correspondence import Correspondence
+from src.data.datamodule import CorrespondenceData
+from src.data.preprocessing import Recipe
+from src.data.sources import open_shapes
+from src.data.store import Store
+from src.runs import BEST, CONFIG, LAST, METRICS, RunError, continued, write_config
+
+ROOT = Path(CONF).parent
+
+FIGURES = {
+    "test/exact_match", "test/geodesic_error", "test/geodesic_error_diameter",
+    "test/within_0.01", "test/within_0.05", "test/within_0.10",
+    "parameters", "seconds/preprocess", "seconds/train",
+}  # fmt: skip
+
+
+def composed(overrides):
+    OmegaConf.register_new_resolver("run_folder", run_folder, replace=True)
+    with initialize_config_dir(CONF, version_base="1.3"):
+        return checked(compose("train", overrides))
+
+
+def run(folder: Path, overrides: list[str]) -> dict[str, float]:
+    folder.mkdir(exist_ok=True)
+    config = composed(overrides)
+    if not (folder / CONFIG).exists():
+        write_config(folder, config)
+    return program.train(config, folder)
+
+
+def weights(folder: Path, name: str = LAST) -> dict[str, torch.Tensor]:
+    return torch.load(folder / name, weights_only=True)["state_dict"]
+
+
+def same_weights(a: Path, b: Path) -> bool:
+    one, two = weights(a), weights(b)
+    assert one.keys() == two.keys()
+    return all(torch.equal(one[k], two[k]) for k in one)
+
+
+@pytest.fixture(scope="module")
+def whole_run(tmp_path_factory, toy_overrides):
+    """A run that nothing interrupts."""
+    folder = tmp_path_factory.mktemp("whole")
+    return folder, run(folder, toy_overrides)
+
+
+# -------------------------------------------------------------------------------- the run folder
+
+
+def test_a_run_folder_holds_what_is_promised(whole_run):
+    folder, metrics = whole_run
+    assert metrics.keys() >= FIGURES
+    assert json.loads((folder / METRICS).read_text()) == metrics
+    assert all(isinstance(value, int | float) for value in metrics.values())
+    for name in (CONFIG, BEST, LAST, "curve.png"):
+        assert (folder / name).is_file()
+    assert list(folder.glob("events.out.tfevents.*"))
+    assert metrics["parameters"] == sum(w.numel() for w in weights(folder).values())
+    assert not list(folder.rglob("*.tmp"))
+
+
+def test_what_is_logged_can_be_seen_in_tensorboard(whole_run):
+    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+    events = EventAccumulator(str(whole_run[0])).Reload()
+    scalars = set(events.Tags()["scalars"])
+    assert scalars >= {
+        "train/loss_step", "train/loss_epoch", "val/loss", "val/exact_match", "val/geodesic_error",
+        "val/geodesic_error_diameter", "val/within_0.01", "val/within_0.05", "val/within_0.10",
+        "lr-Adam", "train/steps_per_second", "test/exact_match",
+    }  # fmt: skip
+    assert len(events.Scalars("val/loss")) == 4  # every epoch
+    assert len(events.Images("val/curve")) == 4
+
+
+def test_a_checkpoint_is_all_that_evaluation_needs(whole_run):
+    """The figures of metrics.json again, from best.ckpt alone and by other means."""
+    folder, metrics = whole_run
+    saved = torch.load(folder / BEST, weights_only=True)["hyper_parameters"]
+    config = saved["config"]
+    assert config == OmegaConf.to_container(OmegaConf.load(folder / CONFIG))
+    module = Correspondence.load_from_checkpoint(folder / BEST, weights_only=True).eval()
+    recipe = Recipe(config["data"]["shot"]["radius"], config["data"]["shot"]["bins"], 8)
+    data = CorrespondenceData(
+        open_shapes(config["data"]), recipe, Store(config["data"]["cache_dir"])
+    )
+    data.prepare(["test"])
+    right = []
+    for item in data.datasets["test"]:
+        first_rows = item["sequences"][item["first"][:-1]].long()  # any start will nearly do
+        with torch.no_grad():
+            right.append(module.net(item["features"], first_rows).argmax(1) == item["labels"])
+    assert torch.cat(right).float().mean() == pytest.approx(metrics["test/exact_match"], abs=0.06)
+
+
+def test_geodesic_errors_over_area_and_over_diameter_have_one_ratio(whole_run):
+    folder, metrics = whole_run
+    config = OmegaConf.to_container(OmegaConf.load(folder / CONFIG))
+    data = CorrespondenceData(open_shapes(config["data"]), None, Store(config["data"]["cache_dir"]))
+    ratio = metrics["test/geodesic_error"] / metrics["test/geodesic_error_diameter"]
+    assert ratio == pytest.approx(data.reference().diameter, rel=1e-5)
+
+
+# ---------------------------------------------------------------------------------- repeatability
+
+
+def test_two_runs_with_one_seed_agree_to_the_bit_and_another_seed_differs(
+    whole_run, toy_overrides, tmp_path
+):
+    folder, metrics = whole_run
+    again = run(tmp_path / "again", toy_overrides)
+    assert same_weights(folder, tmp_path / "again")
+    assert {k: v for k, v in again.items() if "seconds" not in k} == {
+        k: v for k, v in metrics.items() if "seconds" not in k
+    }
+    run(tmp_path / "other", [*toy_overrides, "seed=1", "optim.epochs=1"])
+    assert not same_weights(folder, tmp_path / "other")
+
+
+STEPS = 6  # an epoch of the toy data set has as many
+
+
+@pytest.mark.parametrize(
+    "signum, step",
+    [(signal.SIGINT, step) for step in (1, 2, STEPS - 1, STEPS, STEPS + 3, 4 * STEPS)]
+    + [(signal.SIGTERM, 2), (signal.SIGTERM, STEPS)],
+)
+def test_a_stopped_run_goes_on_as_if_it_had_not_been(
+    whole_run, toy_overrides, tmp_path, monkeypatch, signum, step
+):
+    """Ctrl-C after the first step, in the middle, at the end of an epoch, and after the last."""
+    end = Speed.on_train_batch_end
+
+    def stop(self, trainer, *args):
+        end(self, trainer, *args)
+        if trainer.global_step == step:
+            os.kill(os.getpid(), signum)
+
+    monkeypatch.setattr(Speed, "on_train_batch_end", stop)
+    with pytest.raises(Stopped) as stopped:
+        run(tmp_path, toy_overrides)
+    assert stopped.value.signum == signum
+    assert (tmp_path / LAST).is_file() and not (tmp_path / METRICS).exists()
+    saved = torch.load(tmp_path / LAST, weights_only=True)
+    assert saved["global_step"] == (6 if step == STEPS - 1 else step)  # see OrderlyStop
+    monkeypatch.setattr(Speed, "on_train_batch_end", end)
+    metrics = run(tmp_path, toy_overrides)
+    assert same_weights(whole_run[0], tmp_path)
+    for name in FIGURES - {"seconds/preprocess", "seconds/train"}:
+        assert metrics[name] == whole_run[1][name]
+
+
+def program_process(overrides, folder) -> subprocess.Popen:
+    command = [sys.executable, "-m", "src.train", *overrides, f"hydra.run.dir={folder}"]
+    return subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.STDOUT,
+                            text=True, start_new_session=True)  # fmt: skip
+
+
+def wait_for(condition, process, seconds=120):
+    end = time.monotonic() + seconds
+    while not condition():
+        assert process.poll() is None, process.communicate()[0]
+        assert time.monotonic() < end, "nothing happened"
+        time.sleep(0.01)
+
+
+def test_a_killed_run_resumes_to_the_same_weights(toy_overrides, tmp_path):
+    """A real process, a real kill -9, and resume=<run folder> on the command line."""
+    overrides = [*toy_overrides, "optim.epochs=12"]
+    run(tmp_path / "whole", overrides)
+    folder = tmp_path / "killed"
+    process = program_process(overrides, folder)
+    seen = set()
+
+    def third_checkpoint():
+        if (folder / LAST).exists():
+            seen.add((folder / LAST).stat().st_mtime_ns)
+        return len(seen) >= 3
+
+    wait_for(third_checkpoint, process)
+    process.kill()
+    process.wait()
+    epoch = torch.load(folder / LAST, weights_only=True)["epoch"]
+    assert 1 <= epoch < 11 and not (folder / METRICS).exists()
+    resumed = subprocess.run(
+        [sys.executable, "-m", "src.train", f"resume={folder}"],
+        cwd=ROOT, capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    assert resumed.returncode == 0, resumed.stderr
+    assert same_weights(tmp_path / "whole", folder)
+    assert f"Run folder:  {folder}" in resumed.stdout
+    assert json.loads((folder / METRICS).read_text()).keys() >= FIGURES
+
+
+@pytest.mark.parametrize("signum, code", [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_a_stopped_program_says_how_to_go_on(toy_overrides, tmp_path, signum, code):
+    folder = tmp_path / "run"
+    process = program_process([*toy_overrides, "optim.epochs=500"], folder)
+    wait_for((folder / LAST).exists, process)
+    process.send_signal(signum)
+    output, _ = process.communicate(timeout=60)
+    assert process.returncode == code
+    assert f"To go on: python -m src.train resume={folder}" in output
+    assert "Traceback" not in output
+    torch.load(folder / LAST, weights_only=True)
+
+
+def test_a_checkpoint_that_cannot_be_written_leaves_the_last_one(tmp_path, monkeypatch):
+    io = WholeFiles()
+    io.save_checkpoint({"a": torch.ones(3)}, tmp_path / "last.ckpt")
+
+    def full(checkpoint, file):
+        file.write(b"half")
+        raise RuntimeError("PytorchStreamWriter failed writing file data/0: file write failed")
+
+    monkeypatch.setattr(torch, "save", full)
+    with pytest.raises(OSError, match=r"cannot write the checkpoint .*last\.ckpt"):
+        io.save_checkpoint({"a": torch.zeros(3)}, tmp_path / "last.ckpt")
+    assert torch.load(tmp_path / "last.ckpt", weights_only=True)["a"].sum() == 3
+    assert [p.name for p in tmp_path.iterdir()] == ["last.ckpt"]
+
+
+def test_resume_takes_the_runs_config_and_only_harmless_changes(tmp_path, toy_overrides):
+    write_config(tmp_path, composed(toy_overrides))
+    resume = [f"resume={tmp_path}"]
+    assert continued(composed(resume), resume).model.channels == [12, 14, 16]
+    same = [*toy_overrides, *resume]
+    assert continued(composed(same), same).seq_len == 8
+    faster = [*resume, "trainer.threads=2"]
+    assert continued(composed(faster), faster).trainer.threads == 2
+    for other in ("seq_len=9", "model=lstm", "seed=4", "optim.lr=0.1", "+metric=true"):
+        overrides = [*resume, other]
+        with pytest.raises(RunError, match="contradicts the run in"):
+            continued(composed(overrides), overrides)
+
+
+def test_resume_of_what_is_no_run_is_one_message(tmp_path):
+    for path, message in [(tmp_path / "none", "is not a folder"), (tmp_path, "it is no run")]:
+        overrides = [f"resume={path}"]
+        with pytest.raises(RunError, match=message):
+            continued(composed(overrides), overrides)
+    (tmp_path / CONFIG).write_text("a: [1, ")
+    with pytest.raises(RunError, match="can't be read"):
+        continued(composed([f"resume={tmp_path}"]), [f"resume={tmp_path}"])
+
+
+# -------------------------------------------------------------------------------------- learning
+
+
+@pytest.mark.parametrize(
+    "overrides",
+    [["model=lstm", "optim.epochs=1"], ["model=lstm", "metric=true", "optim.epochs=1"],
+     ["metric=true", "optim.epochs=1"], ["metric=true", "model.metric_layers=first", "optim.epochs=1"],
+     ["model=lstm", "model.rings=1", "+metric=true", "optim.epochs=2"],
+     ["trainer.precision=bf16", "optim.epochs=1"], ["trainer.precision=auto", "optim.epochs=1"],
+     ["trainer.precision=64", "optim.epochs=1"], ["optim.schedule=constant", "optim.epochs=1"],
+     ["trainer.val_every=2", "optim.epochs=3"]],
+    ids=" ".join,
+)  # fmt: skip
+def test_every_variant_trains(toy_overrides, tmp_path, overrides):
+    metrics = run(tmp_path, [*toy_overrides, *overrides])
+    assert metrics.keys() >= FIGURES and all(np.isfinite(v) for v in metrics.values())
+
+
+LEARN = ["optim.epochs=60", "optim.lr=0.01", "model.dropout=0.1", "trainer.val_every=20"]
+
+
+def test_a_network_learns_and_the_numbering_does_not_help_it(toy_overrides, tmp_path):
+    """With every mesh renumbered at random the figures agree within noise."""
+    plain = run(tmp_path / "plain", [*toy_overrides, *LEARN])
+    shuffled = run(tmp_path / "shuffled", [*toy_overrides, *LEARN, "data.shuffle_vertices=true"])
+    assert plain["test/exact_match"] > 0.6  # chance: 0.006
+    assert shuffled["test/exact_match"] == pytest.approx(plain["test/exact_match"], abs=0.12)
+    assert shuffled["test/geodesic_error"] == pytest.approx(plain["test/geodesic_error"], abs=0.06)
+
+
+def test_the_picture_is_drawn_without_a_display(toy_overrides, tmp_path, monkeypatch):
+    monkeypatch.delenv("DISPLAY", raising=False)
+    run(tmp_path, [*toy_overrides, "optim.epochs=1", "picture=true"])
+    import matplotlib.image
+
+    picture = matplotlib.image.imread(tmp_path / "correspondence.png")[..., :3]
+    assert (picture < 0.95).any(axis=2).mean() > 0.05  # something stands on the white ground
+    assert picture.std(axis=(0, 1)).min() > 0.02
