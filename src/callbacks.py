@@ -15,8 +15,7 @@ from lightning.pytorch.callbacks import Callback, ProgressBar
 from lightning.pytorch.plugins.io import TorchCheckpointIO
 from tqdm import tqdm
 
-from src.cli import Stopped
-from src.runs import LAST
+from src.runs import LAST, Stopped
 
 
 class WholeFiles(TorchCheckpointIO):

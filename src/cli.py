@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import itertools
 import logging
 import os
 import re
@@ -20,21 +21,13 @@ from omegaconf.errors import OmegaConfBaseException
 from src.config import ConfigError, checked
 from src.data.shapes import DataError
 from src.geometry.mesh import MeshError
-from src.runs import RunError
+from src.runs import RunError, Stopped
 
 CONF = str(Path(__file__).parents[1] / "conf")
 USER_ERRORS = (ConfigError, DataError, MeshError, RunError, OSError, HydraException,
                OmegaConfBaseException)  # fmt: skip
 
 log = logging.getLogger("src")
-
-
-class Stopped(BaseException):
-    """Ctrl-C or SIGTERM. The message says how to go on."""
-
-    def __init__(self, signum: int, message: str = "Stopped."):
-        super().__init__(message)
-        self.signum = signum
 
 
 def run_folder(resume: str | None, new: str) -> str:
@@ -113,9 +106,8 @@ def one_line(error: BaseException) -> str:
         lines = [line.strip() for line in str(error).splitlines() if line.strip()]
         for i, line in enumerate(lines):
             if line.startswith("Available options in"):
-                end = next((j for j in range(i, len(lines)) if lines[j].startswith("Config search")),
-                           len(lines))  # fmt: skip
-                return f"{lines[0]}; there are: {', '.join(lines[i + 1 : end])}"
+                options = itertools.takewhile(lambda x: "search path" not in x, lines[i + 1 :])
+                return f"{lines[0]}; there are: {', '.join(options)}"
         cause = error.__cause__
         reason = f" ({str(cause).splitlines()[0]})" if cause is not None and str(cause) else ""
         return lines[0] + reason

@@ -2,12 +2,21 @@
 
 from __future__ import annotations
 
+import os
+import sys
+from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
+from multiprocessing import get_context
 from pathlib import Path
 
 import numpy as np
 from matplotlib.figure import Figure
 
 from src.geometry.mesh import Mesh
+
+
+class RenderError(RuntimeError):
+    """There is no picture; the message says what is missing."""
 
 
 def curve_figure(curves: dict[str, tuple[np.ndarray, np.ndarray]]) -> Figure:
@@ -33,35 +42,59 @@ def template_colors(template: Mesh) -> np.ndarray:
     Equal colours on two shapes mean: the same place of the template.
     """
     low, high = template.vertices.min(axis=0), template.vertices.max(axis=0)
-    place = (template.vertices - low) / np.maximum(high - low, 1e-12)
-    return 0.15 + 0.8 * place
+    return 0.1 + 0.9 * (template.vertices - low) / np.maximum(high - low, 1e-12)
 
 
 def render_row(
-    path: str | Path, meshes: list[Mesh], colors: list[np.ndarray], captions: list[str]
+    path: str | Path, meshes: list[Mesh], colors: list[np.ndarray], captions: list[str], up: str
 ) -> None:
-    """Write a PNG of meshes side by side, seen along the axis of their least extent.
+    """Write a PNG of meshes side by side, as seen from the front.
 
-    colors: for each mesh [V, 3] in 0..1. Nothing is shown on a screen; no display is needed.
+    colors: for each mesh [V, 3] in 0..1. up: the axis that points up, "y" (the front is then +z) or
+    "z" (-y). No display is needed, but an OpenGL library is. Errors: RenderError without one.
     """
-    import pyvista  # starts VTK, which takes seconds: only for who wants a picture
+    # VTK ends the whole process where it finds no OpenGL: so it has one of its own
+    with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as process:
+        try:
+            process.submit(_render_row, path, meshes, colors, captions, up).result()
+        except BrokenProcessPool as error:
+            raise RenderError(
+                "VTK could not draw; it needs an OpenGL library (on Debian: libegl1, libgl1)"
+            ) from error
 
-    plotter = pyvista.Plotter(off_screen=True, window_size=(300 * len(meshes), 520))
+
+def _render_row(path, meshes, colors, captions, up) -> None:
+    if sys.platform == "linux" and "DISPLAY" not in os.environ:
+        os.environ.setdefault("VTK_DEFAULT_OPENGL_WINDOW", "vtkEGLRenderWindow")
+    import pyvista  # takes seconds
+
+    axes = {"y": (0, 1, 2), "z": (0, 2, 1)}[up]
+    placed, left = [], 0.0
+    for mesh in meshes:
+        points = mesh.vertices[:, axes] * ([1, 1, -1] if up == "z" else [1, 1, 1])
+        low, high = points.min(axis=0), points.max(axis=0)
+        points = points - [low[0] - left, (low[1] + high[1]) / 2, (low[2] + high[2]) / 2]
+        left = points[:, 0].max()
+        placed.append(points)
+    tall = max(np.ptp(points[:, 1]) for points in placed)
+    gap = 0.08 * tall
+    width, height = left + gap * (len(meshes) + 1), 1.2 * tall
+    plotter = pyvista.Plotter(off_screen=True, window_size=(int(640 * width / height), 640))
     plotter.set_background("white")
-    height = max(np.ptp(mesh.vertices, axis=0).max() for mesh in meshes)
-    points = []
-    for i, (mesh, color, caption) in enumerate(zip(meshes, colors, captions, strict=True)):
-        middle = (mesh.vertices.min(axis=0) + mesh.vertices.max(axis=0)) / 2
-        vertices = mesh.vertices - middle + [0.75 * height * i, 0.0, 0.0]
-        surface = pyvista.make_tri_mesh(vertices, mesh.faces)
+    for i, (points, mesh, color) in enumerate(zip(placed, meshes, colors, strict=True)):
+        points[:, 0] += gap * (i + 1)
+        surface = pyvista.make_tri_mesh(points, mesh.faces)
         plotter.add_mesh(surface, scalars=np.round(255 * color).astype(np.uint8), rgb=True,
-                         smooth_shading=True)  # fmt: skip
-        points.append([0.75 * height * i, 0.0, -0.58 * height])
-        del caption
-    plotter.add_point_labels(np.array(points), captions, shape=None, show_points=False,
-                             text_color="black", font_size=16, justification_horizontal="center",
-                             always_visible=True)  # fmt: skip
-    plotter.camera_position = "xz"
+                         smooth_shading=True, ambient=0.25)  # fmt: skip
+    below = [[(p[:, 0].min() + p[:, 0].max()) / 2, -0.57 * tall, 0] for p in placed]
+    plotter.add_point_labels(np.array(below), captions, shape=None, show_points=False,
+                             text_color="black", font_size=18, bold=False, always_visible=True,
+                             justification_horizontal="center")  # fmt: skip
+    plotter.view_xy()
     plotter.enable_parallel_projection()
+    plotter.camera.focal_point = (width / 2, 0, 0)
+    plotter.camera.position = (width / 2, 0, 10 * tall)
+    plotter.camera.parallel_scale = height / 2
+    plotter.reset_camera_clipping_range()
     plotter.screenshot(str(path))
     plotter.close()

@@ -20,6 +20,14 @@ class RunError(ValueError):
     """A folder that is no run, or one that can't be continued as asked."""
 
 
+class Stopped(BaseException):
+    """Ctrl-C or SIGTERM. The message says how to go on."""
+
+    def __init__(self, signum: int, message: str = "Stopped."):
+        super().__init__(message)
+        self.signum = signum
+
+
 def write_whole(path: Path, text: str) -> None:
     """Write a file that appears whole or not at all."""
     temporary = path.with_name(path.name + ".tmp")

@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
-from tests.meshes import bumpy_sphere
 
 from src.geometry.mesh import Mesh
+from tests.meshes import bumpy_sphere
 
 TOY_SPLIT = {"train": 6, "val": 2, "test": 2}
 

@@ -25,9 +25,14 @@ def bumpy_sphere(seed: int = 0, subdivisions: int = 2, bump: float = 0.25) -> Me
     rng = np.random.default_rng(seed)
     sphere = trimesh.creation.icosphere(subdivisions=subdivisions)
     x = np.asarray(sphere.vertices)
-    radius = 1 + bump * sum(
-        rng.normal() * np.sin(x @ rng.normal(size=3) * 2 + rng.uniform(0, 6)) for _ in range(6)
-    ) / 6
+    radius = (
+        1
+        + bump
+        * sum(
+            rng.normal() * np.sin(x @ rng.normal(size=3) * 2 + rng.uniform(0, 6)) for _ in range(6)
+        )
+        / 6
+    )
     return Mesh(x * radius[:, None] * [1.0, 0.8, 1.3], sphere.faces)
 
 

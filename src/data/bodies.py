@@ -21,6 +21,8 @@ class Bodies(ShapeSet):
     bodies. Errors: DataError for any other size.
     """
 
+    up = "z"
+
     def __init__(self, vertices: int = 1500) -> None:
         if vertices not in SIZES:
             raise DataError(f"vertices: the bodies come with 1500 or 6890, got {vertices!r}")

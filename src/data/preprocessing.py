@@ -40,7 +40,7 @@ class Task:
 
 
 def descriptor_task(mesh_: Mesh, recipe: Recipe) -> Task:
-    """SHOT: `features` float32 [V, 32 (bins + 1)], zeros where undefined; `undefined` their count."""
+    """SHOT: `features` float32 [V, 32 (bins + 1)], zeros where undefined; `undefined`: how many."""
     version = code_version(mesh, shot)
     key = digest(mesh_.vertices, mesh_.faces, recipe.shot_radius, recipe.shot_bins, version)
     return Task("shot", key, _descriptors, (mesh_, recipe.shot_radius, recipe.shot_bins))

@@ -49,10 +49,12 @@ class ShapeSet(ABC):
 
     template: the reference mesh whose vertices are the labels and on which errors are measured.
     names: for each of "train", "val" and "test" the names of its shapes, in a fixed order.
+    up: the axis, "y" or "z", that points up; only pictures ask for it.
     """
 
     template: Mesh
     names: dict[str, list[str]]
+    up = "y"
 
     @abstractmethod
     def load(self, name: str) -> Shape:

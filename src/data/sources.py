@@ -5,10 +5,13 @@ from __future__ import annotations
 from typing import Any
 
 from src.data.bodies import Bodies
+from src.data.datamodule import CorrespondenceData
 from src.data.faust import Faust
 from src.data.faust_benchmark import FaustBenchmark
 from src.data.folder import Folder
+from src.data.preprocessing import Recipe
 from src.data.shapes import ShapeSet
+from src.data.store import Store
 
 SOURCES = {"bodies": Bodies, "faust": Faust, "faust_benchmark": FaustBenchmark, "folder": Folder}
 COMMON = ("name", "shot", "shuffle_vertices", "cache_dir", "workers")  # not the source's affair
@@ -18,3 +21,13 @@ def open_shapes(data: dict[str, Any]) -> ShapeSet:
     """The data set that a data config describes. Errors: DataError, MeshError."""
     options = {key: value for key, value in data.items() if key not in COMMON}
     return SOURCES[data["name"]](**options)
+
+
+def open_data(config: dict[str, Any]) -> CorrespondenceData:
+    """The data module that a whole config describes, in plain containers. Errors: as above."""
+    data, rings = config["data"], config["model"].get("rings")
+    shot = data["shot"]
+    recipe = Recipe(shot["radius"], shot["bins"], None if rings else config["seq_len"], rings)
+    store = Store(data["cache_dir"])
+    return CorrespondenceData(open_shapes(data), recipe, store, config["seed"],
+                              data["shuffle_vertices"], data["workers"])  # fmt: skip

@@ -13,7 +13,7 @@ SUFFIXES = (".ply", ".obj", ".off", ".stl")
 
 
 class MeshError(ValueError):
-    """A mesh or mesh file that cannot be used; the message names it, the rule and what was found."""
+    """A mesh or file that cannot be used; the message names it, the rule and what was found."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,7 +37,9 @@ class Mesh:
         vertices = np.ascontiguousarray(self.vertices, dtype=np.float64)
         faces = np.asarray(self.faces)
         if vertices.ndim != 2 or vertices.shape[1] != 3 or len(vertices) == 0:
-            raise MeshError(f"{self.name}: vertices must be [V, 3] with V > 0, got {vertices.shape}")
+            raise MeshError(
+                f"{self.name}: vertices must be [V, 3] with V > 0, got {vertices.shape}"
+            )
         if faces.size == 0:
             faces = faces.reshape(0, 3).astype(np.int32)
         if faces.ndim != 2 or faces.shape[1] != 3:

@@ -115,7 +115,11 @@ def _longest(neighbours, first, rings):
     """The largest number of vertices within `rings` rings of any vertex."""
     count = len(first) - 1
     seen = np.full(count, -1, np.int64)
-    out, parent, depth = np.empty(count, np.int32), np.empty(count, np.int32), np.empty(count, np.int32)
+    out, parent, depth = (
+        np.empty(count, np.int32),
+        np.empty(count, np.int32),
+        np.empty(count, np.int32),
+    )
     longest = 1
     for v in range(count):
         end = _spiral(v, 0, neighbours, first, rings, seen, v, out, parent, depth)

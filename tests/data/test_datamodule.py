@@ -85,7 +85,9 @@ def test_items_hold_what_they_say(store):
     np.testing.assert_array_equal(item["first"], table.first)
     np.testing.assert_array_equal(item["labels"], np.arange(162))
     assert item["unit"] == pytest.approx(0.3 * np.sqrt(mesh.area)) and item["index"] == 1
-    dtypes = {name: str(t.dtype).removeprefix("torch.") for name, t in item.items() if name != "index"}
+    dtypes = {
+        name: str(t.dtype).removeprefix("torch.") for name, t in item.items() if name != "index"
+    }
     assert dtypes == {"features": "float32", "sequences": "int32", "first": "int64",
                       "labels": "int64", "vertices": "float32", "unit": "float32"}  # fmt: skip
     assert data.num_classes == 162 and data.in_features == item["features"].shape[1] == 32 * 5
@@ -152,7 +154,7 @@ def test_a_sampler_that_skips_goes_on_where_it_was():
 
 
 def test_renumbered_meshes_give_renumbered_tensors(store):
-    """Nothing in the chain depends on vertex numbers: descriptors, labels and spirals move along."""
+    """Nothing depends on vertex numbers: descriptors, labels and spirals move along."""
     plain, shuffled = serve(store), serve(store, shuffle_vertices=True)
     for a, b in zip(plain.datasets["train"].items, shuffled.datasets["train"].items, strict=True):
         order = b["labels"]  # vertex i of the shuffled mesh is vertex order[i] of the plain one
@@ -185,7 +187,8 @@ def test_a_second_run_computes_nothing(store, monkeypatch):
 
 
 @pytest.mark.parametrize(
-    "change", [{"shot_radius": 0.31}, {"shot_bins": 5}, {"seq_len": 9}, {"seq_len": None, "rings": 1}]
+    "change",
+    [{"shot_radius": 0.31}, {"shot_bins": 5}, {"seq_len": 9}, {"seq_len": None, "rings": 1}],
 )
 def test_keys_depend_on_every_parameter(change):
     mesh = bumpy_sphere()

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 import trimesh
-from tests.meshes import bumpy_sphere, lattice, punctured, random_meshes
 
 from src.geometry.mesh import Mesh, MeshError, parse_mesh, read_mesh
+from tests.meshes import bumpy_sphere, lattice, punctured, random_meshes
 
 SQUARE = [[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]]
 

@@ -1,7 +1,13 @@
 """The spiral operator has the properties that Lim et al. 2018, section 3.1, define it by."""
 
+import itertools
+
 import numpy as np
 import pytest
+
+from src.geometry.connectivity import one_rings
+from src.geometry.mesh import Mesh
+from src.geometry.spirals import spiral_table
 from tests.meshes import (
     bow_tie,
     bumpy_sphere,
@@ -12,10 +18,6 @@ from tests.meshes import (
     two_cones,
     union,
 )
-
-from src.geometry.connectivity import one_rings
-from src.geometry.mesh import Mesh
-from src.geometry.spirals import spiral_table
 
 MESHES = random_meshes()
 every_mesh = pytest.mark.parametrize("mesh", MESHES.values(), ids=MESHES)
@@ -141,7 +143,7 @@ def test_on_a_regular_neighbourhood_the_spiral_never_jumps(mesh):
     assert len(inner) >= 9
     for v in inner:
         for row in rows_of(table, v):
-            assert all(b in neighbours[a] for a, b in zip(row, row[1:], strict=False))
+            assert all(b in neighbours[a] for a, b in itertools.pairwise(row))
 
 
 @every_mesh
@@ -302,7 +304,9 @@ def test_where_fans_meet_all_of_them_are_listed_whatever_the_numbering(mesh):
     assert all(sorted(r.tolist()) == list(range(count)) for r in row)
     neighbours, _ = one_rings(mesh)
     distance = np.linalg.norm(mesh.vertices, axis=1)
-    if mesh.faces.shape[0] == 10:  # a closed fan is entered at its nearest vertex, nearest fan first
+    if (
+        mesh.faces.shape[0] == 10
+    ):  # a closed fan is entered at its nearest vertex, nearest fan first
         nearest = [1 + distance[1:6].argmin(), 6 + distance[6:11].argmin()]
         nearest.sort(key=lambda v: distance[v])
         assert neighbours[0] == nearest[0] and neighbours[5] == nearest[1]

@@ -8,6 +8,7 @@ from torch.nn import functional as F
 
 from src.nn.layers import SpiralLinear, SpiralLSTM, gather, metric_features
 
+
 def sequences(vertices, length, padded, seed=0):
     rng = torch.Generator().manual_seed(seed)
     shift = torch.stack([1 + torch.randperm(vertices - 1, generator=rng)[: length - 1]

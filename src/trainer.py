@@ -1,0 +1,77 @@
+"""Lightning's trainer as a config asks for it."""
+
+from __future__ import annotations
+
+import logging
+import warnings
+from pathlib import Path
+
+import lightning as L
+import torch
+from lightning.pytorch.callbacks import Callback, LearningRateMonitor, ModelCheckpoint
+from lightning.pytorch.loggers import TensorBoardLogger
+from omegaconf import DictConfig
+
+from src.callbacks import Bar, OrderlyStop, WholeFiles
+
+
+def build_trainer(config: DictConfig, folder: Path, *callbacks: Callback) -> L.Trainer:
+    """A trainer that logs to, and keeps its checkpoints in, a run folder.
+
+    best.ckpt is that of the least mean geodesic error on validation, last.ckpt of the last epoch.
+    """
+    quiet()
+    torch.set_num_threads(config.trainer.threads or torch.get_num_threads())
+    torch.set_flush_denormal(True)  # tiny probabilities would slow the softmax down tenfold
+    keep = {"dirpath": folder / "checkpoints", "enable_version_counter": False}
+    return L.Trainer(
+        accelerator=config.trainer.accelerator,
+        devices=config.trainer.devices,
+        strategy=config.trainer.strategy,
+        precision=choose_precision(config.trainer.precision, config.trainer.accelerator),
+        max_epochs=config.optim.epochs,
+        check_val_every_n_epoch=config.trainer.val_every,
+        deterministic=config.trainer.accelerator == "cpu",
+        logger=TensorBoardLogger(folder, name="", version="", default_hp_metric=False),
+        log_every_n_steps=10,
+        num_sanity_val_steps=0,
+        enable_model_summary=False,
+        plugins=[WholeFiles()],
+        callbacks=[
+            Bar(),
+            OrderlyStop(folder),
+            LearningRateMonitor("step"),
+            ModelCheckpoint(filename="best", monitor="val/geodesic_error", **keep),
+            ModelCheckpoint(filename="last", save_on_train_epoch_end=True, **keep),
+            *callbacks,
+        ],
+    )
+
+
+def choose_precision(wanted: str, accelerator: str) -> str:
+    """Lightning's name for a precision; auto is bf16 where the hardware multiplies it, else 32."""
+    if wanted == "auto":
+        if accelerator == "cpu":
+            native = [getattr(torch.cpu, f"_is_{name}_supported", bool)
+                      for name in ("avx512_bf16", "amx_tile")]  # fmt: skip
+            wanted = "bf16" if any(check() for check in native) else "32"
+        else:
+            wanted = (
+                "bf16" if torch.cuda.is_available() and torch.cuda.is_bf16_supported() else "32"
+            )
+    return {"32": "32-true", "64": "64-true", "bf16": "bf16-mixed"}[wanted]
+
+
+def quiet() -> None:
+    """Leave out what Lightning says of things that are as they should be here."""
+    for name in ("lightning.pytorch", "lightning.fabric", "lightning_fabric"):
+        logging.getLogger(name).setLevel(logging.WARNING)
+    for message in (
+        ".*does not have many workers.*",  # all tensors are in memory
+        ".*exists and is not empty.*",  # a run that goes on
+        ".*`isinstance.treespec, LeafSpec.` is deprecated.*",
+        ".*smaller than the logging interval.*",
+        ".*GPU available but not used.*",
+        ".*ended before the epoch ended and your dataloader is not resumable.*",  # ours goes on
+    ):
+        warnings.filterwarnings("ignore", message)

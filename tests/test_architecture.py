@@ -1,0 +1,72 @@
+"""Imports point against the flow of data: mesh -> tensors -> network -> metric -> figure."""
+
+from __future__ import annotations
+
+import ast
+from pathlib import Path
+
+import pytest
+
+SRC = Path(__file__).parents[1] / "src"
+
+# what each part may import of src; an entry point may import all but another entry point
+ALLOWED = {
+    "geometry": {"geometry"},
+    "nn": {"nn"},
+    "data": {"data", "geometry"},
+    "metrics": set(),
+    "figures": {"geometry"},
+    "runs": set(),
+    "config": set(),
+    "callbacks": {"runs"},
+    "correspondence": {"data", "nn", "metrics", "figures"},
+    "trainer": {"callbacks"},
+    "summary": {"correspondence", "data", "figures", "metrics"},
+    "cli": {"config", "runs", "data", "geometry"},
+}
+ENTRY_POINTS = {"train", "evaluate", "match", "report", "benchmark"}
+NOT_IN_GEOMETRY = {"torch", "hydra", "omegaconf", "lightning", "torchmetrics"}
+NOT_IN_NETWORKS = NOT_IN_GEOMETRY - {"torch"} | {"numpy", "trimesh", "potpourri3d", "numba"}
+
+
+def imports(source: str) -> set[str]:
+    """All modules that a source imports, anywhere in it."""
+    found = set()
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, ast.Import):
+            found |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom):
+            assert node.level == 0, "relative imports hide where they point"
+            found |= {node.module} | {f"{node.module}.{alias.name}" for alias in node.names}
+    return found
+
+
+def violations(part: str, source: str) -> set[str]:
+    allowed = ALLOWED.get(part, set(ALLOWED) if part in ENTRY_POINTS else set())
+    ours = {name.split(".")[1] for name in imports(source) if name.startswith("src.")}
+    others = {name.split(".")[0] for name in imports(source)}
+    foreign = {"geometry": NOT_IN_GEOMETRY, "nn": NOT_IN_NETWORKS}.get(part, set())
+    return (ours - allowed) | (others & foreign)
+
+
+MODULES = [path for path in sorted(SRC.rglob("*.py")) if path.name != "__init__.py"]
+
+
+@pytest.mark.parametrize("path", MODULES, ids=lambda path: str(path.relative_to(SRC)))
+def test_imports_point_against_the_flow(path):
+    part = path.relative_to(SRC).parts[0].removesuffix(".py")
+    assert part in ALLOWED.keys() | ENTRY_POINTS, f"say in ALLOWED what {part} may import"
+    assert violations(part, path.read_text()) == set()
+
+
+def test_a_wrong_import_is_found():
+    assert violations("geometry", "def f():\n    import torch") == {"torch"}
+    assert violations("nn", "from src.data.store import Store") == {"data"}
+    assert violations("data", "from src import nn\nimport src.nn.layers") == {"nn"}
+    assert violations("evaluate", "from src.train import main") == {"train"}
+    assert violations("evaluate", "from src.correspondence import Correspondence") == set()
+
+
+@pytest.mark.parametrize("path", MODULES, ids=lambda path: str(path.relative_to(SRC)))
+def test_modules_stay_small(path):
+    assert len(path.read_text().splitlines()) <= 300
