@@ -45,7 +45,9 @@ class Correspondence(L.LightningModule):
         self.optim = config["optim"]
         self.seed = config["seed"]
         self.errors = nn.ModuleDict({split: CorrespondenceError() for split in ("val", "test")})
-        self.curves: dict[str, np.ndarray] = {}  # of the latest evaluation of each split
+        # of the latest evaluation of each split; a checkpoint brings those of validation along
+        self.figures: dict[str, dict[str, float]] = {}
+        self.curves: dict[str, np.ndarray] = {}
         self.predictions: dict[int, np.ndarray] = {}  # of the latest test, by mesh
 
     def setup(self, stage: str) -> None:
@@ -96,12 +98,21 @@ class Correspondence(L.LightningModule):
         self.errors[split].reset()
         self.curves[split] = values.pop("curve").cpu().numpy()
         values["geodesic_error_diameter"] = values["geodesic_error"] / self.distances.diameter
-        for name, value in values.items():
-            # already over all meshes of all ranks, so nothing is left to average
-            self.log(f"{split}/{name}", value.float(), batch_size=1)
+        self.figures[split] = {f"{split}/{name}": float(value) for name, value in values.items()}
+        # already over all meshes of all ranks, so nothing is left to average
+        self.log_dict(self.figures[split], batch_size=1)
         if self.logger is not None and not self.trainer.sanity_checking:
             figure = curve_figure({split: (THRESHOLDS, self.curves[split])})
             self.logger.experiment.add_figure(f"{split}/curve", figure, self.current_epoch)
+
+    def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        if "val" in self.curves:
+            checkpoint["validation"] = (self.figures["val"], torch.from_numpy(self.curves["val"]))
+
+    def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        if "validation" in checkpoint:
+            self.figures["val"], curve = checkpoint["validation"]
+            self.curves["val"] = curve.numpy()
 
     def configure_optimizers(self) -> dict[str, Any]:
         optim = self.optim

@@ -44,6 +44,7 @@ def train(config: DictConfig, folder: Path) -> dict[str, float]:
     from src.data.sources import open_data
     from src.trainer import build_trainer
 
+    log.info("run folder: %s", folder)
     plain = OmegaConf.to_container(config)
     data = open_data(plain)
     began = time.perf_counter()
@@ -61,13 +62,15 @@ def train(config: DictConfig, folder: Path) -> dict[str, float]:
     last = folder / LAST
     trainer.fit(module, datamodule=data, weights_only=True,
                 ckpt_path=last if last.exists() else None)  # fmt: skip
+    trained = speed.seconds  # best.ckpt, loaded below, brings an earlier clock
     [tested] = trainer.test(module, datamodule=data, ckpt_path=folder / BEST, weights_only=True,
                             verbose=False)  # fmt: skip
     metrics = {
         **tested,
+        **module.figures["val"],  # of best.ckpt, to choose settings by
         "parameters": parameters,
         "seconds/preprocess": seconds,
-        "seconds/train": speed.seconds,
+        "seconds/train": trained,
     }
     if trainer.is_global_zero:
         trainer.logger.log_hyperparams(flat(plain), tested)

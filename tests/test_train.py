@@ -79,6 +79,16 @@ def test_a_run_folder_holds_what_is_promised(whole_run):
     assert not list(folder.rglob("*.tmp"))
 
 
+def test_metrics_hold_the_validation_of_the_best_checkpoint_and_the_time_of_all_training(whole_run):
+    folder, metrics = whole_run
+    saved = {name: torch.load(folder / name, weights_only=True) for name in (BEST, LAST)}
+    figures, curve = saved[BEST]["validation"]
+    assert figures.items() <= metrics.items()
+    assert curve[0] == pytest.approx(figures["val/exact_match"])
+    clocks = [checkpoint["callbacks"]["Speed"]["seconds"] for checkpoint in saved.values()]
+    assert metrics["seconds/train"] > max(clocks)
+
+
 def test_what_is_logged_can_be_seen_in_tensorboard(whole_run):
     from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
