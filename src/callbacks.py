@@ -116,7 +116,8 @@ class Speed(Callback):
 
     def on_train_epoch_end(self, trainer: L.Trainer, module: L.LightningModule) -> None:
         if self._busy > 0:
-            module.log("train/steps_per_second", self._steps / self._busy, batch_size=1)
+            speed = self._steps / self._busy
+            module.log("train/steps_per_second", speed, batch_size=1, sync_dist=True)
         self._steps, self._busy = 0, 0.0
 
     def state_dict(self) -> dict[str, float]:

@@ -154,6 +154,8 @@ def checked(config: DictConfig) -> DictConfig:
     for key, values in ONE_OF.items():
         if (value := OmegaConf.select(typed, key)) not in values:
             raise ConfigError(f"{key} must be one of {', '.join(values)}; got {value}")
+    if typed.seed >= 2**32:
+        raise ConfigError(f"seed must be below {2**32}; got {typed.seed}")
     if len(typed.model.channels) != 3 or min(typed.model.channels) < 1:
         raise ConfigError(
             f"model.channels must hold three numbers of at least 1; got {typed.model.channels}"

@@ -68,7 +68,7 @@ class Correspondence(L.LightningModule):
     def training_step(self, batch: Batch, batch_idx: int) -> Tensor:
         head = self.net.head
         loss = linear_cross_entropy(self.embed(batch), head.weight, head.bias, batch["labels"])
-        self.log("train/loss", loss, on_step=True, on_epoch=True, batch_size=1)
+        self.log("train/loss", loss, on_step=True, on_epoch=True, batch_size=1, sync_dist=True)
         return loss
 
     def validation_step(self, batch: Batch, batch_idx: int) -> None:
@@ -100,7 +100,7 @@ class Correspondence(L.LightningModule):
         values["geodesic_error_diameter"] = values["geodesic_error"] / self.distances.diameter
         self.figures[split] = {f"{split}/{name}": float(value) for name, value in values.items()}
         # already over all meshes of all ranks, so nothing is left to average
-        self.log_dict(self.figures[split], batch_size=1)
+        self.log_dict(self.figures[split], batch_size=1, sync_dist=True)
         if self.logger is not None and not self.trainer.sanity_checking:
             figure = curve_figure({split: (THRESHOLDS, self.curves[split])})
             self.logger.experiment.add_figure(f"{split}/curve", figure, self.current_epoch)

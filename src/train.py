@@ -9,6 +9,7 @@ from pathlib import Path
 from omegaconf import DictConfig, OmegaConf
 
 from src.cli import entry_point
+from src.config import checked
 from src.runs import BEST, LAST, Stopped, continued, write_config, write_metrics
 
 log = logging.getLogger("src.train")
@@ -22,7 +23,7 @@ def main(config: DictConfig) -> None:
     folder = Path(hydra.runtime.output_dir)
     if config.resume:
         folder = Path(config.resume)
-        config = continued(config, list(hydra.overrides.task))
+        config = checked(continued(config, list(hydra.overrides.task)))
     else:
         write_config(folder, config)
     try:
@@ -42,6 +43,7 @@ def train(config: DictConfig, folder: Path) -> dict[str, float]:
     from src.callbacks import Speed
     from src.correspondence import Correspondence
     from src.data.sources import open_data
+    from src.figures import RenderError
     from src.trainer import build_trainer
 
     log.info("run folder: %s", folder)
@@ -79,10 +81,10 @@ def train(config: DictConfig, folder: Path) -> dict[str, float]:
         if config.picture:
             try:
                 summary.draw_shapes(folder / "correspondence.png", data, module.predictions)
-            except summary.RenderError as error:
+            except RenderError as error:
                 log.warning("no correspondence.png: %s", error)
         write_metrics(folder, metrics)
-        log.info(summary.table(folder, data, module, metrics))
+        log.info(summary.table(folder, data, metrics))
     return metrics
 
 

@@ -10,42 +10,53 @@ import lightning as L
 import torch
 from lightning.pytorch.callbacks import Callback, LearningRateMonitor, ModelCheckpoint
 from lightning.pytorch.loggers import TensorBoardLogger
+from lightning.pytorch.utilities.exceptions import MisconfigurationException
 from omegaconf import DictConfig
 
 from src.callbacks import Bar, OrderlyStop, WholeFiles
+from src.config import ConfigError
 
 
 def build_trainer(config: DictConfig, folder: Path, *callbacks: Callback) -> L.Trainer:
     """A trainer that logs to, and keeps its checkpoints in, a run folder.
 
     best.ckpt is that of the least mean geodesic error on validation, last.ckpt of the last epoch.
+    Errors: ConfigError for a device that this machine lacks.
     """
     quiet()
     torch.set_num_threads(config.trainer.threads or torch.get_num_threads())
     torch.set_flush_denormal(True)  # tiny probabilities would slow the softmax down tenfold
+    asked = config.trainer
     keep = {"dirpath": folder / "checkpoints", "enable_version_counter": False}
-    return L.Trainer(
-        accelerator=config.trainer.accelerator,
-        devices=config.trainer.devices,
-        strategy=config.trainer.strategy,
-        precision=choose_precision(config.trainer.precision, config.trainer.accelerator),
-        max_epochs=config.optim.epochs,
-        check_val_every_n_epoch=config.trainer.val_every,
-        deterministic=config.trainer.accelerator == "cpu",
-        logger=TensorBoardLogger(folder, name="", version="", default_hp_metric=False),
-        log_every_n_steps=10,
-        num_sanity_val_steps=0,
-        enable_model_summary=False,
-        plugins=[WholeFiles()],
-        callbacks=[
-            Bar(),
-            OrderlyStop(folder),
-            LearningRateMonitor("step"),
-            ModelCheckpoint(filename="best", monitor="val/geodesic_error", **keep),
-            ModelCheckpoint(filename="last", save_on_train_epoch_end=True, **keep),
-            *callbacks,
-        ],
-    )
+    try:
+        return L.Trainer(
+            accelerator=asked.accelerator,
+            devices=asked.devices,
+            strategy=asked.strategy,
+            precision=choose_precision(asked.precision, asked.accelerator),
+            max_epochs=config.optim.epochs,
+            check_val_every_n_epoch=asked.val_every,
+            deterministic=asked.accelerator == "cpu",
+            logger=TensorBoardLogger(folder, name="", version="", default_hp_metric=False),
+            log_every_n_steps=10,
+            num_sanity_val_steps=0,
+            enable_model_summary=False,
+            plugins=[WholeFiles()],
+            callbacks=[
+                Bar(),
+                OrderlyStop(folder),
+                LearningRateMonitor("step"),
+                ModelCheckpoint(filename="best", monitor="val/geodesic_error", **keep),
+                ModelCheckpoint(filename="last", save_on_train_epoch_end=True, **keep),
+                *callbacks,
+            ],
+        )
+    except (MisconfigurationException, ValueError, TypeError) as error:
+        reason = str(error).strip().splitlines()[0]
+        raise ConfigError(
+            f"trainer: accelerator {asked.accelerator}, devices {asked.devices}, strategy "
+            f"{asked.strategy}, precision {asked.precision} can't be had here ({reason})"
+        ) from error
 
 
 def choose_precision(wanted: str, accelerator: str) -> str:

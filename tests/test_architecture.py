@@ -20,7 +20,7 @@ ALLOWED = {
     "config": set(),
     "callbacks": {"runs"},
     "correspondence": {"data", "nn", "metrics", "figures"},
-    "trainer": {"callbacks"},
+    "trainer": {"callbacks", "config"},
     "summary": {"correspondence", "data", "figures", "metrics"},
     "cli": {"config", "runs", "data", "geometry"},
 }

@@ -6,6 +6,7 @@ import signal
 import sys
 
 import pytest
+import torch
 from hydra.core.global_hydra import GlobalHydra
 from omegaconf import OmegaConf
 
@@ -123,6 +124,7 @@ def test_an_experiment_may_set_metric_and_the_command_line_may_still_say_it():
         (["data=faust"], "data.root"),
         (["data=folder", "data.root=/none", "data.template=t.ply"], "/none is not a folder"),
         (["data.vertices=12"], "1500"),
+        (["seed=99999999999"], "seed must be below 4294967296; got 99999999999"),
         (["resume=nowhere"], "resume=nowhere: is not a folder"),
         (["optim.lr=", "x y"], ""),
         (["hydra.run.dir=/dev/null/run"], "/dev/null"),
@@ -136,6 +138,18 @@ def test_a_mistake_is_one_clear_line(cli, arguments, message):
     last = (out + err).strip().splitlines()[-1]
     assert last.startswith("error: ") and message in last, out + err
     assert (out + err).count("error: ") == 1 and "Traceback" not in out + err
+
+
+@pytest.mark.parametrize(
+    "override",
+    ["trainer.accelerator=abacus", "trainer.devices=none", "trainer.strategy=luck"]
+    + ["trainer=gpu"] * (not torch.cuda.is_available()),
+)
+def test_a_device_that_is_not_there_is_one_clear_line(cli, toy_overrides, override):
+    code, out, err = cli(*toy_overrides, override)
+    last = (out + err).strip().splitlines()[-1]
+    assert code == 1 and last.startswith("error: trainer: accelerator")
+    assert "Traceback" not in out + err
 
 
 def test_help_shows_groups_root_keys_and_three_commands(cli):
