@@ -51,7 +51,7 @@ class Correspondence(L.LightningModule):
         self.predictions: dict[int, np.ndarray] = {}  # of the latest test, by mesh
 
     def setup(self, stage: str) -> None:
-        self.distances = self.trainer.datamodule.reference()
+        self.distances = self.trainer.datamodule.reference
 
     def embed(self, batch: Batch) -> Tensor:
         metric = None

@@ -125,7 +125,7 @@ def test_geodesic_errors_over_area_and_over_diameter_have_one_ratio(whole_run):
     config = OmegaConf.to_container(OmegaConf.load(folder / CONFIG))
     data = open_data(config)
     ratio = metrics["test/geodesic_error"] / metrics["test/geodesic_error_diameter"]
-    assert ratio == pytest.approx(data.reference().diameter, rel=1e-5)
+    assert ratio == pytest.approx(data.reference.diameter, rel=1e-5)
 
 
 # ---------------------------------------------------------------------------------- repeatability
@@ -236,12 +236,11 @@ def test_a_checkpoint_that_cannot_be_written_leaves_the_last_one(tmp_path, monke
     io = WholeFiles()
     io.save_checkpoint({"a": torch.ones(3)}, tmp_path / "last.ckpt")
 
-    def full(checkpoint, file):
-        file.write(b"half")
-        raise RuntimeError("PytorchStreamWriter failed writing file data/0: file write failed")
+    def full(descriptor):
+        raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(torch, "save", full)
-    with pytest.raises(OSError, match=r"cannot write the checkpoint .*last\.ckpt"):
+    monkeypatch.setattr(os, "fsync", full)
+    with pytest.raises(OSError, match=r"cannot write the checkpoint .*last\.ckpt \(No space left"):
         io.save_checkpoint({"a": torch.zeros(3)}, tmp_path / "last.ckpt")
     assert torch.load(tmp_path / "last.ckpt", weights_only=True)["a"].sum() == 3
     assert [p.name for p in tmp_path.iterdir()] == ["last.ckpt"]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Iterator
+from functools import cached_property
 
 import lightning as L
 import numpy as np
@@ -116,6 +117,7 @@ class CorrespondenceData(L.LightningDataModule):
     def in_features(self) -> int:
         return 32 * (self.recipe.shot_bins + 1)
 
+    @cached_property
     def reference(self) -> ReferenceDistances:
         """Distances on the template, in units of the square root of its area."""
         return ReferenceDistances(self.shapes.template, self.store)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import numpy as np
 from tqdm import tqdm
 
@@ -27,9 +29,8 @@ class ReferenceDistances:
         self._solver: geodesics.GeodesicSolver | None = None
         self._key = digest(template.vertices, template.faces, BLOCK, code_version(geodesics))
         self._unit = np.sqrt(template.area)
-        self.diameter = float(
-            store.get("diameter", self._key, self._compute_diameter)["diameter"]
-        )  # fmt: skip
+        kept = store.get("diameter", self._key, self._compute_diameter)
+        self.diameter = float(kept["diameter"])
 
     def __call__(self, sources: np.ndarray, targets: np.ndarray) -> np.ndarray:
         """float64 [K]: the distance from sources[k] to targets[k], both int64 [K]."""
@@ -44,17 +45,10 @@ class ReferenceDistances:
 
     def _ensure(self, blocks: np.ndarray) -> None:
         missing = [int(block) for block in blocks if block not in self._blocks]
-        rows = len(missing) * BLOCK * len(self.template.vertices)
-        quiet = rows < 1e6 or all(self._store.has(*self._entry(block)) for block in missing)
-        for block in tqdm(missing, desc="Geodesic distances", unit="block", leave=False,
-                          disable=quiet, delay=1.0):  # fmt: skip
-            kind, key = self._entry(block)
-            self._blocks[block] = self._store.get(kind, key, lambda b=block: self._compute(b))[
-                "distances"
-            ]
-
-    def _entry(self, block: int) -> tuple[str, str]:
-        return "distances", f"{self._key}-{block}"
+        progress = tqdm(missing, desc="Geodesic distances", unit="block", leave=False, delay=1.0)
+        for block in progress:
+            key, compute = f"{self._key}-{block}", partial(self._compute, block)
+            self._blocks[block] = self._store.get("distances", key, compute)["distances"]
 
     def _compute(self, block: int) -> dict[str, np.ndarray]:
         self._solver = self._solver or geodesics.GeodesicSolver(self.template)
