@@ -8,6 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from joblib import Parallel, cpu_count, delayed
+from joblib.externals.loky import get_reusable_executor
 from tqdm import tqdm
 
 from src.data.store import Arrays, Store, code_version, digest
@@ -100,8 +101,11 @@ def _run(task: Task, store: Store) -> None:
 
 def _run_in_pool(tasks: list[Task], store: Store, workers: int, progress: tqdm) -> None:
     pool = Parallel(n_jobs=workers, return_as="generator_unordered")
-    for _ in pool(delayed(_run)(task, store) for task in tasks):
-        progress.update()
+    try:
+        for _ in pool(delayed(_run)(task, store) for task in tasks):
+            progress.update()
+    finally:  # idle workers would stay for minutes, with their memory
+        get_reusable_executor().shutdown(kill_workers=True)
 
 
 def load_task(task: Task, store: Store) -> Arrays:
