@@ -12,7 +12,7 @@ from typing import Any
 
 import lightning as L
 import torch
-from lightning.pytorch.callbacks import Callback, ProgressBar
+from lightning.pytorch.callbacks import Callback, ModelCheckpoint, ProgressBar
 from lightning.pytorch.plugins.io import TorchCheckpointIO
 from tqdm import tqdm
 
@@ -28,7 +28,7 @@ class WholeFiles(TorchCheckpointIO):
     def save_checkpoint(self, checkpoint: dict[str, Any], path: Any, storage_options=None) -> None:
         path = Path(path)
         path.parent.mkdir(parents=True, exist_ok=True)
-        temporary = path.with_name(f"{path.name}.{os.getpid()}.tmp")
+        temporary = path.with_name(f"{path.name}.tmp")
         try:
             whole = io.BytesIO()  # torch.save to a full disk would not say that it is full
             torch.save(checkpoint, whole)
@@ -43,8 +43,26 @@ class WholeFiles(TorchCheckpointIO):
             raise OSError(f"cannot write the checkpoint {path} ({reason})") from error
 
 
+class Checkpoint(ModelCheckpoint):
+    """Lightning's, but a run folder that was moved keeps its best checkpoint when it goes on."""
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        here = str(self.dirpath)
+        moved = {
+            name: str(Path(here, Path(state[name]).name))
+            for name in ("best_model_path", "kth_best_model_path", "last_model_path")
+            if state.get(name)
+        }
+        best = {str(Path(here, Path(path).name)): score
+                for path, score in state.get("best_k_models", {}).items()}  # fmt: skip
+        super().load_state_dict({**state, **moved, "dirpath": here, "best_k_models": best})
+
+
 class Bar(ProgressBar):
-    """One bar for the whole training, with the time left and the latest figures."""
+    """One bar for the whole training, with the time left and the latest figures.
+
+    Validation and test show one of their own where they take longer than a second.
+    """
 
     def __init__(self) -> None:
         super().__init__()
@@ -68,6 +86,7 @@ class Bar(ProgressBar):
         self._bar.update()
 
     def on_validation_end(self, trainer: L.Trainer, module: L.LightningModule) -> None:
+        self._evaluation.close()
         values = trainer.callback_metrics
         if self._bar is not None and "val/exact_match" in values:
             self._bar.set_postfix_str(
@@ -79,6 +98,25 @@ class Bar(ProgressBar):
 
     def on_train_end(self, trainer: L.Trainer, module: L.LightningModule) -> None:
         self._close()
+
+    def on_validation_start(self, trainer: L.Trainer, module: L.LightningModule) -> None:
+        self._begin("Validation", trainer.num_val_batches)
+
+    def on_test_start(self, trainer: L.Trainer, module: L.LightningModule) -> None:
+        self._begin("Test", trainer.num_test_batches)
+
+    def _begin(self, what: str, batches: list[int]) -> None:
+        self._evaluation = tqdm(total=sum(batches), desc=what, unit="mesh", leave=False, delay=1.0,
+                                disable=not self.trainer.is_global_zero)  # fmt: skip
+
+    def on_validation_batch_end(self, *_) -> None:
+        self._evaluation.update()
+
+    def on_test_batch_end(self, *_) -> None:
+        self._evaluation.update()
+
+    def on_test_end(self, trainer: L.Trainer, module: L.LightningModule) -> None:
+        self._evaluation.close()
 
     def on_exception(self, trainer, module, exception) -> None:
         self._close()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import hashlib
 import itertools
 import logging
 import os
@@ -48,8 +49,11 @@ def job_folder(overrides: list[str], number: int) -> str:
             if not override.is_sweep_override():
                 fixed.add(override.key_or_group)
     varied = [o.lstrip("+") for o in overrides if parse(o).key_or_group not in fixed]
-    name = "_".join(re.sub(r"[^\w.+-]+", "-", o) for o in varied)
-    return name[:200] or str(number)
+    name = "_".join(varied).replace("=", "-") or str(number)
+    legal = re.sub(r"[^\w.+-]+", "-", name)[:120]
+    if legal != name:  # what was lost may be what tells two jobs apart
+        legal += "-" + hashlib.sha256(name.encode()).hexdigest()[:8]
+    return legal
 
 
 def entry_point(name: str) -> Callable[[Callable[[DictConfig], None]], Callable[[], None]]:

@@ -126,6 +126,10 @@ def checked(config: DictConfig) -> DictConfig:
     """
     typed = OmegaConf.structured(Train)
     plain = OmegaConf.to_container(config, resolve=True)
+    for group in ("model", "data", "trainer", "optim", "data.shot"):
+        node = OmegaConf.select(config, group)
+        if not OmegaConf.is_dict(node):
+            raise ConfigError(f"{group} is a group of settings; got {node}")
     for group, schemas in (("model", MODELS), ("data", DATASETS)):
         name = plain.get(group, {}).get("name")
         if name not in schemas:
@@ -136,7 +140,9 @@ def checked(config: DictConfig) -> DictConfig:
     _known(plain["trainer"], Trainer, "trainer.")
     _known(plain["optim"], Optim, "optim.")
     _known(plain["data"]["shot"], Shot, "data.shot.")
-    if plain["model"].get("metric") is None:
+    if plain.get("metric") is not None:
+        plain["model"]["metric"] = plain["metric"]  # the root key wins over an experiment's
+    elif plain["model"].get("metric") is None:
         plain["model"]["metric"] = False
     for key, value in _leaves(plain):
         try:
@@ -154,6 +160,20 @@ def checked(config: DictConfig) -> DictConfig:
     for key, values in ONE_OF.items():
         if (value := OmegaConf.select(typed, key)) not in values:
             raise ConfigError(f"{key} must be one of {', '.join(values)}; got {value}")
+    if typed.trainer.val_every > typed.optim.epochs:
+        raise ConfigError(
+            f"trainer.val_every must be at most optim.epochs, {typed.optim.epochs}: without a "
+            f"validation there is no best checkpoint; got {typed.trainer.val_every}"
+        )
+    if len(typed.optim.betas) != 2 or not all(0 <= beta < 1 for beta in typed.optim.betas):
+        raise ConfigError(
+            f"optim.betas must be two numbers in 0..1, 1 left out; got {typed.optim.betas}"
+        )
+    if typed.data.name == "folder":
+        for split in ("train", "val", "test"):
+            names = typed.data[split]
+            if not isinstance(names, str) and not all(isinstance(n, str) for n in names or [0]):
+                raise ConfigError(f"data.{split} must be file names or patterns; got {names}")
     if typed.seed >= 2**32:
         raise ConfigError(f"seed must be below {2**32}; got {typed.seed}")
     if len(typed.model.channels) != 3 or min(typed.model.channels) < 1:

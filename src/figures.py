@@ -57,7 +57,7 @@ def render_row(
     with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as process:
         try:
             process.submit(_render_row, path, meshes, colors, captions, up).result()
-        except BrokenProcessPool as error:
+        except (BrokenProcessPool, ImportError) as error:
             raise RenderError(
                 "VTK could not draw; it needs an OpenGL library (on Debian: libegl1, libgl1)"
             ) from error

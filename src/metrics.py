@@ -22,7 +22,7 @@ def geodesic_errors(
     labels: np.ndarray,
     distances: Callable[[np.ndarray, np.ndarray], np.ndarray],
 ) -> np.ndarray:
-    """float64 [V]: distances(labels, predicted), 0 where they agree.
+    """float64 [V]: how far from the right vertex of the template the predicted one is.
 
     predicted, labels: int64 [V], vertices of the template. distances: from sources [K] to targets
     [K], for instance `ReferenceDistances`.
@@ -38,7 +38,12 @@ def correspondence_curve(errors: np.ndarray, thresholds: np.ndarray = THRESHOLDS
     """
     if len(errors) == 0:
         return np.full(len(thresholds), np.nan)
-    return np.searchsorted(np.sort(errors), thresholds, side="right") / len(errors)
+    return _counts(errors, thresholds) / len(errors)
+
+
+def _counts(errors: np.ndarray, thresholds: np.ndarray) -> np.ndarray:
+    """int64 [T]: how many errors are at most each threshold."""
+    return np.searchsorted(np.sort(errors), thresholds, side="right")
 
 
 class CorrespondenceError(Metric):
@@ -62,9 +67,7 @@ class CorrespondenceError(Metric):
         self.vertices += len(errors)
         self.exact += int(exact.sum())
         self.error += float(errors.sum())
-        if len(errors):
-            shares = torch.from_numpy(correspondence_curve(errors))
-            self.within += (shares * len(errors)).round().to(self.within.device)
+        self.within += torch.from_numpy(_counts(errors, THRESHOLDS)).to(self.within.device)
 
     def compute(self) -> dict[str, torch.Tensor]:
         curve = self.within / self.vertices

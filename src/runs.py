@@ -4,15 +4,15 @@ from __future__ import annotations
 
 import json
 import os
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
-from omegaconf.errors import OmegaConfBaseException
 
 CONFIG, METRICS = "config.yaml", "metrics.json"
 BEST, LAST = "checkpoints/best.ckpt", "checkpoints/last.ckpt"
-# what may differ when a run is continued: how and where it is computed, and for how long
+# what may differ when a run is continued: how and where it is computed
 MAY_CHANGE = ("trainer", "data.cache_dir", "data.workers", "picture")
 
 
@@ -35,8 +35,28 @@ def write_whole(path: Path, text: str) -> None:
     os.replace(temporary, path)
 
 
-def write_config(folder: Path, config: DictConfig) -> None:
-    write_whole(folder / CONFIG, OmegaConf.to_yaml(config, resolve=True))
+def claim(folder: Path, config: DictConfig) -> None:
+    """Make a folder that of a run with this config.
+
+    A folder that is so already may be claimed again: the run goes on. Errors: RunError if it holds
+    a run with another config.
+    """
+    path = folder / CONFIG
+    if path.exists():
+        if different := differences(config, _load(folder)):
+            raise RunError(
+                f"{folder} holds another run ({', '.join(different[:3])} differ); "
+                "choose another folder, or go on with that run with resume="
+            )
+        return
+    write_whole(path, OmegaConf.to_yaml(config, resolve=True))
+
+
+def differences(config: DictConfig, stored: DictConfig) -> list[str]:
+    """The keys in which two configs would make two different runs."""
+    one, two = (dict(_leaves(OmegaConf.to_container(c, resolve=True))) for c in (config, stored))
+    keys = [key for key in one.keys() | two.keys() if key != "resume" and not _may_change(key)]
+    return sorted(key for key in keys if one.get(key) != two.get(key))
 
 
 def write_metrics(folder: Path, metrics: dict[str, Any]) -> None:
@@ -51,31 +71,53 @@ def continued(config: DictConfig, overrides: list[str]) -> DictConfig:
     Errors: RunError if the folder is no run, or if an override contradicts the run.
     """
     folder = Path(config.resume)
-    try:
-        stored = OmegaConf.load(folder / CONFIG)
-        OmegaConf.set_struct(stored, False)
-    except FileNotFoundError as error:
-        what = "is not a folder" if not folder.is_dir() else f"holds no {CONFIG}: it is no run"
-        raise RunError(f"resume={config.resume}: {what}") from error
-    except (OSError, ValueError, OmegaConfBaseException, Exception) as error:
-        raise RunError(f"{folder / CONFIG} can't be read: {str(error).splitlines()[0]}") from error
+    stored = _load(folder)
     for override in overrides:
         key = override.lstrip("+~").split("=")[0]
-        if key in ("resume", "experiment"):
+        if key == "resume":
             continue
-        new, old = OmegaConf.select(config, key), OmegaConf.select(stored, key)
-        if _plain(new) == _plain(old):
-            continue
-        if not any(key == k or key.startswith(k + ".") for k in MAY_CHANGE):
+        if key == "experiment":  # it may set anything
+            contradicts = bool(differences(config, stored))
+        else:
+            new, old = _plain(config, key), _plain(stored, key)
+            contradicts = new != old and not _may_change(key)
+        if contradicts:
             raise RunError(
-                f"{override} contradicts the run in {folder} ({key}={old}); leave it out to go on "
-                f"with the run, or leave out resume= to start another. Free to change are: "
-                f"{', '.join(MAY_CHANGE)}"
+                f"{override} contradicts the run in {folder}; leave it out to go on with the run, "
+                f"or leave out resume= to start another. Free to change: {', '.join(MAY_CHANGE)}"
             )
-        OmegaConf.update(stored, key, new)
+        if _may_change(key):
+            OmegaConf.update(stored, key, new)
     stored.resume = None
     return stored
 
 
-def _plain(node: Any) -> Any:
+def _load(folder: Path) -> DictConfig:
+    if not folder.is_dir():
+        raise RunError(f"resume={folder}: is not a folder")
+    if not (folder / CONFIG).is_file():
+        raise RunError(f"resume={folder}: holds no {CONFIG}: it is no run")
+    try:
+        stored = OmegaConf.load(folder / CONFIG)
+    except Exception as error:  # whatever YAML says of a damaged file
+        raise RunError(f"{folder / CONFIG} can't be read: {str(error).splitlines()[0]}") from error
+    if not isinstance(stored, DictConfig):
+        raise RunError(f"{folder / CONFIG} is no config")
+    return stored
+
+
+def _may_change(key: str) -> bool:
+    return any(key == free or key.startswith(free + ".") for free in MAY_CHANGE)
+
+
+def _leaves(tree: dict[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+    for key, value in tree.items():
+        if isinstance(value, dict):
+            yield from _leaves(value, f"{prefix}{key}.")
+        else:
+            yield prefix + key, value
+
+
+def _plain(config: DictConfig, key: str) -> Any:
+    node = OmegaConf.select(config, key)
     return OmegaConf.to_container(node, resolve=True) if OmegaConf.is_config(node) else node

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import shlex
 import time
 from pathlib import Path
 
@@ -10,7 +11,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from src.cli import entry_point
 from src.config import checked
-from src.runs import BEST, LAST, Stopped, continued, write_config, write_metrics
+from src.runs import BEST, LAST, RunError, Stopped, claim, continued, write_metrics
 
 log = logging.getLogger("src.train")
 
@@ -25,13 +26,12 @@ def main(config: DictConfig) -> None:
         folder = Path(config.resume)
         config = checked(continued(config, list(hydra.overrides.task)))
     else:
-        write_config(folder, config)
+        claim(folder, config)
     try:
         train(config, folder)
     except Stopped as stopped:
-        raise Stopped(
-            stopped.signum, f"Stopped. To go on: python -m src.train resume={folder}"
-        ) from None
+        how = f"Stopped. To go on: python -m src.train {shlex.quote(f'resume={folder}')}"
+        raise Stopped(stopped.signum, how) from None
 
 
 def train(config: DictConfig, folder: Path) -> dict[str, float]:
@@ -62,6 +62,9 @@ def train(config: DictConfig, folder: Path) -> dict[str, float]:
         log.info(line)
 
     last = folder / LAST
+    for checkpoint in (last, folder / BEST):
+        if checkpoint.exists():
+            check(checkpoint, plain)
     trainer.fit(module, datamodule=data, weights_only=True,
                 ckpt_path=last if last.exists() else None)  # fmt: skip
     trained = speed.seconds  # best.ckpt, loaded below, brings an earlier clock
@@ -77,15 +80,32 @@ def train(config: DictConfig, folder: Path) -> dict[str, float]:
     if trainer.is_global_zero:
         trainer.logger.log_hyperparams(flat(plain), tested)
         trainer.logger.finalize("success")
+        write_metrics(folder, metrics)
         summary.draw_curve(folder / "curve.png", module)
         if config.picture:
             try:
                 summary.draw_shapes(folder / "correspondence.png", data, module.predictions)
             except RenderError as error:
                 log.warning("no correspondence.png: %s", error)
-        write_metrics(folder, metrics)
         log.info(summary.table(folder, data, metrics))
     return metrics
+
+
+def check(checkpoint: Path, config: dict) -> None:
+    """Errors: RunError if a checkpoint can't be read, or is of another network."""
+    import torch
+
+    try:
+        saved = torch.load(checkpoint, weights_only=True, map_location="cpu", mmap=True)
+        theirs = saved["hyper_parameters"]["config"]
+    except Exception as error:  # whatever a damaged file makes torch say
+        reason = str(error).splitlines()[0][:100]
+        raise RunError(
+            f"{checkpoint} is damaged ({reason}); without last.ckpt a run begins anew"
+        ) from error
+    for key in ("model", "seq_len"):
+        if theirs[key] != config[key]:
+            raise RunError(f"{checkpoint} is of another run: its {key} is {theirs[key]}")
 
 
 def describe(config: DictConfig, data, parameters: int, precision: str, seconds: float):

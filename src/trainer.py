@@ -8,12 +8,12 @@ from pathlib import Path
 
 import lightning as L
 import torch
-from lightning.pytorch.callbacks import Callback, LearningRateMonitor, ModelCheckpoint
+from lightning.pytorch.callbacks import Callback, LearningRateMonitor
 from lightning.pytorch.loggers import TensorBoardLogger
 from lightning.pytorch.utilities.exceptions import MisconfigurationException
 from omegaconf import DictConfig
 
-from src.callbacks import Bar, OrderlyStop, WholeFiles
+from src.callbacks import Bar, Checkpoint, OrderlyStop, WholeFiles
 from src.config import ConfigError
 
 
@@ -40,14 +40,15 @@ def build_trainer(config: DictConfig, folder: Path, *callbacks: Callback) -> L.T
             logger=TensorBoardLogger(folder, name="", version="", default_hp_metric=False),
             log_every_n_steps=10,
             num_sanity_val_steps=0,
+            use_distributed_sampler=False,  # ours divide the meshes, and repeat none in a test
             enable_model_summary=False,
             plugins=[WholeFiles()],
             callbacks=[
                 Bar(),
                 OrderlyStop(folder),
                 LearningRateMonitor("step"),
-                ModelCheckpoint(filename="best", monitor="val/geodesic_error", **keep),
-                ModelCheckpoint(filename="last", save_on_train_epoch_end=True, **keep),
+                Checkpoint(filename="best", monitor="val/geodesic_error", **keep),
+                Checkpoint(filename="last", save_on_train_epoch_end=True, **keep),
                 *callbacks,
             ],
         )

@@ -22,7 +22,7 @@ from src.cli import CONF, run_folder
 from src.config import checked
 from src.correspondence import Correspondence
 from src.data.sources import open_data
-from src.runs import BEST, CONFIG, LAST, METRICS, RunError, Stopped, continued, write_config
+from src.runs import BEST, CONFIG, LAST, METRICS, RunError, Stopped, continued, claim
 
 ROOT = Path(CONF).parent
 
@@ -43,7 +43,7 @@ def run(folder: Path, overrides: list[str]) -> dict[str, float]:
     folder.mkdir(exist_ok=True)
     config = composed(overrides)
     if not (folder / CONFIG).exists():
-        write_config(folder, config)
+        claim(folder, config)
     return program.train(config, folder)
 
 
@@ -247,7 +247,7 @@ def test_a_checkpoint_that_cannot_be_written_leaves_the_last_one(tmp_path, monke
 
 
 def test_resume_takes_the_runs_config_and_only_harmless_changes(tmp_path, toy_overrides):
-    write_config(tmp_path, composed(toy_overrides))
+    claim(tmp_path, composed(toy_overrides))
     resume = [f"resume={tmp_path}"]
     assert continued(composed(resume), resume).model.channels == [12, 14, 16]
     same = [*toy_overrides, *resume]

@@ -63,22 +63,26 @@ class MeshDataset(Dataset):
 class EpochSampler(Sampler[int]):
     """A fresh order in every epoch, the same for the same seed and epoch.
 
-    `skip` leaves out as many items at the beginning of the first epoch served: those that a run
-    had done before it was stopped.
+    rank of world: of several processes, this one serves every world-th item. They need equally
+    many, so where the size does not divide, the first items of the order stand at its end again.
+    skip: leaves out as many of this process's items at the beginning of the first epoch served:
+    those that a run had done before it was stopped.
     """
 
-    def __init__(self, size: int, seed: int, skip: int = 0):
+    def __init__(self, size: int, seed: int, skip: int = 0, rank: int = 0, world: int = 1):
         self.size, self.seed, self.skip, self.epoch = size, seed, skip, 0
+        self.rank, self.world = rank, world
 
     def set_epoch(self, epoch: int) -> None:
         """Called by Lightning before each epoch."""
         self.epoch = epoch
 
     def __len__(self) -> int:
-        return self.size
+        return -(-self.size // self.world)
 
     def __iter__(self) -> Iterator[int]:
-        order = np.random.default_rng([self.seed, self.epoch]).permutation(self.size).tolist()
+        order = np.random.default_rng([self.seed, self.epoch]).permutation(self.size)
+        order = np.resize(order, len(self) * self.world)[self.rank :: self.world].tolist()
         skip, self.skip = self.skip, 0
         yield from order[skip:]
 
@@ -173,14 +177,27 @@ class CorrespondenceData(L.LightningDataModule):
 
     def train_dataloader(self) -> DataLoader:
         skip, self._skip = self._skip, 0
-        sampler = EpochSampler(len(self.datasets["train"]), self.seed, skip)
+        rank, world = self._place()
+        sampler = EpochSampler(len(self.datasets["train"]), self.seed, skip, rank, world)
         return DataLoader(self.datasets["train"], batch_size=None, sampler=sampler)
 
     def val_dataloader(self) -> DataLoader:
-        return DataLoader(self.datasets["val"], batch_size=None)
+        return self._in_order("val")
 
     def test_dataloader(self) -> DataLoader:
-        return DataLoader(self.datasets["test"], batch_size=None)
+        return self._in_order("test")
+
+    def _in_order(self, split: str) -> DataLoader:
+        """Every mesh once, divided among the processes."""
+        rank, world = self._place()
+        size = len(self.datasets[split])
+        if size < world:
+            raise DataError(f"{world} processes can't share the {size} meshes to {split}")
+        return DataLoader(self.datasets[split], batch_size=None, sampler=range(rank, size, world))
+
+    def _place(self) -> tuple[int, int]:
+        trainer = self.trainer
+        return (trainer.global_rank, trainer.world_size) if trainer is not None else (0, 1)
 
     def on_after_batch_transfer(self, batch: Batch, dataloader_idx: int) -> Batch:
         batch = dict(batch)

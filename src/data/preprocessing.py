@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
+import sys
 import time
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
 import numpy as np
 from joblib import Parallel, cpu_count, delayed
-from joblib.externals.loky import get_reusable_executor
 from tqdm import tqdm
 
 from src.data.store import Arrays, Store, code_version, digest
@@ -42,14 +42,14 @@ class Task:
 
 def descriptor_task(mesh_: Mesh, recipe: Recipe) -> Task:
     """SHOT: `features` float32 [V, 32 (bins + 1)], zeros where undefined; `undefined`: how many."""
-    version = code_version(mesh, shot)
+    version = code_version(mesh, shot, sys.modules[__name__])
     key = digest(mesh_.vertices, mesh_.faces, recipe.shot_radius, recipe.shot_bins, version)
     return Task("shot", key, _descriptors, (mesh_, recipe.shot_radius, recipe.shot_bins))
 
 
 def spiral_task(mesh_: Mesh, recipe: Recipe) -> Task:
     """`sequences` and `first` of `SpiralTable`, kept by one-rings: one table serves all poses."""
-    version = code_version(connectivity, spirals)
+    version = code_version(connectivity, spirals, sys.modules[__name__])
     rings = connectivity.one_rings(mesh_)
     key = digest(*rings, recipe.seq_len, recipe.rings, version)
     return Task("spirals", key, _spirals, (mesh_, recipe.seq_len, recipe.rings))
@@ -100,12 +100,10 @@ def _run(task: Task, store: Store) -> None:
 
 
 def _run_in_pool(tasks: list[Task], store: Store, workers: int, progress: tqdm) -> None:
-    pool = Parallel(n_jobs=workers, return_as="generator_unordered")
-    try:
-        for _ in pool(delayed(_run)(task, store) for task in tasks):
-            progress.update()
-    finally:  # idle workers would stay for minutes, with their memory
-        get_reusable_executor().shutdown(kill_workers=True)
+    # idle workers would stay for five minutes, with their memory
+    pool = Parallel(n_jobs=workers, return_as="generator_unordered", idle_worker_timeout=2)
+    for _ in pool(delayed(_run)(task, store) for task in tasks):
+        progress.update()
 
 
 def load_task(task: Task, store: Store) -> Arrays:

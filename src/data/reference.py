@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+import sys
 from functools import partial
+from importlib.metadata import version
 
 import numpy as np
 from tqdm import tqdm
 
 from src.data.store import Store, code_version, digest
-from src.geometry import geodesics
+from src.geometry import geodesics, mesh
 from src.geometry.mesh import Mesh
 
 BLOCK = 256  # rows kept in one file
+IN_MEMORY = 2**30  # bytes of rows; all of them up to 16,000 vertices
 
 
 class ReferenceDistances:
@@ -27,7 +30,8 @@ class ReferenceDistances:
         self.template, self._store = template, store
         self._blocks: dict[int, np.ndarray] = {}
         self._solver: geodesics.GeodesicSolver | None = None
-        self._key = digest(template.vertices, template.faces, BLOCK, code_version(geodesics))
+        versions = code_version(geodesics, mesh, sys.modules[__name__]), version("potpourri3d")
+        self._key = digest(template.vertices, template.faces, *versions)
         self._unit = np.sqrt(template.area)
         kept = store.get("diameter", self._key, self._compute_diameter)
         self.diameter = float(kept["diameter"])
@@ -37,18 +41,21 @@ class ReferenceDistances:
         distances = np.zeros(len(sources))
         apart = np.flatnonzero(sources != targets)
         blocks = sources[apart] // BLOCK
-        self._ensure(np.unique(blocks))
-        for block in np.unique(blocks):
+        progress = tqdm(np.unique(blocks), desc="Geodesic distances", unit="block", leave=False,
+                        delay=1.0)  # fmt: skip
+        for block in progress:
             pairs = apart[blocks == block]
-            distances[pairs] = self._blocks[block][sources[pairs] % BLOCK, targets[pairs]]
+            distances[pairs] = self._block(int(block))[sources[pairs] % BLOCK, targets[pairs]]
         return distances
 
-    def _ensure(self, blocks: np.ndarray) -> None:
-        missing = [int(block) for block in blocks if block not in self._blocks]
-        progress = tqdm(missing, desc="Geodesic distances", unit="block", leave=False, delay=1.0)
-        for block in progress:
+    def _block(self, block: int) -> np.ndarray:
+        if block not in self._blocks:
             key, compute = f"{self._key}-{block}", partial(self._compute, block)
-            self._blocks[block] = self._store.get("distances", key, compute)["distances"]
+            rows = self._store.get("distances", key, compute)["distances"]
+            if (len(self._blocks) + 1) * rows.nbytes > IN_MEMORY and self._blocks:
+                del self._blocks[next(iter(self._blocks))]
+            self._blocks[block] = rows
+        return self._blocks[block]
 
     def _compute(self, block: int) -> dict[str, np.ndarray]:
         self._solver = self._solver or geodesics.GeodesicSolver(self.template)

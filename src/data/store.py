@@ -68,11 +68,11 @@ class Store:
                 arrays = {name: file[name] for name in file.files}  # reading checks each CRC
         except FileNotFoundError:
             return None
-        except (OSError, ValueError, EOFError, KeyError, TypeError, NotImplementedError,
+        except (OSError, ValueError, EOFError, KeyError, TypeError, RuntimeError,
                 zipfile.BadZipFile, zlib.error) as error:  # fmt: skip
             log.warning("%s is damaged (%s); computing it again", path, error)
             return None
-        if str(arrays.pop("key", "")) != key:
+        if arrays.pop("key", np.array([])).tolist() != [key, *sorted(arrays)]:
             log.warning("%s is not what its name says; computing it again", path)
             return None
         return arrays
@@ -85,7 +85,7 @@ class Store:
             path.parent.mkdir(parents=True, exist_ok=True)
             with tempfile.NamedTemporaryFile(dir=path.parent, suffix=".tmp", delete=False) as file:
                 temporary = file.name
-                np.savez(file, key=np.array(key), **arrays)
+                np.savez(file, key=np.array([key, *sorted(arrays)]), **arrays)
             os.replace(temporary, path)
         except BaseException as error:
             if temporary is not None and os.path.exists(temporary):

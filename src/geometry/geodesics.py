@@ -5,25 +5,36 @@ from __future__ import annotations
 import numpy as np
 import potpourri3d
 
-from src.geometry.mesh import Mesh
+from src.geometry.mesh import Mesh, MeshError
 
 
 class GeodesicSolver:
     """Distances from single vertices, in the mesh's unit; the factorisation is made once.
 
     The heat method is a smooth approximation, within about one per cent at ordinary resolutions.
-    From one component to another there is no distance: inf.
+    From one component to another, and from a vertex without a face, there is no distance: inf.
+    Errors: MeshError for a mesh without surface area.
     """
 
     def __init__(self, mesh: Mesh):
-        self._solver = potpourri3d.MeshHeatMethodDistanceSolver(mesh.vertices, mesh.faces)
+        if mesh.area == 0:
+            raise MeshError(f"{mesh.name}: no surface area, so no distances on it")
+        self._used, faces = np.unique(mesh.faces, return_inverse=True)
+        self._place = np.full(len(mesh.vertices), -1)
+        self._place[self._used] = np.arange(len(self._used))
         self._component = _components(mesh)
+        self._solver = potpourri3d.MeshHeatMethodDistanceSolver(
+            mesh.vertices[self._used], faces.reshape(-1, 3)
+        )
 
     def row(self, source: int) -> np.ndarray:
         """float64 [V], the distance of every vertex to `source`; exactly 0 at the source."""
-        row = np.maximum(self._solver.compute_distance(int(source)), 0.0)
+        row = np.full(len(self._place), np.inf)
+        if self._place[source] >= 0:
+            distances = self._solver.compute_distance(int(self._place[source]))
+            row[self._used] = np.maximum(distances, 0.0)
+            row[self._component != self._component[source]] = np.inf
         row[source] = 0.0
-        row[self._component != self._component[source]] = np.inf
         return row
 
 

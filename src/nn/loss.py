@@ -68,6 +68,11 @@ class _LinearCrossEntropy(torch.autograd.Function):
 
 @torch.no_grad()
 def predict(x: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
-    """int64 [V]: the class with the largest score x weight^T + bias; arguments as above."""
-    return torch.cat([(x[i : i + ROWS] @ weight.T + bias).argmax(dim=1)
-                      for i in range(0, len(x), ROWS)])  # fmt: skip
+    """int64 [V]: the class with the largest score x weight^T + bias; arguments as above.
+
+    Never in bf16: among its 8 bits many scores would tie, and the first class win.
+    """
+    with torch.autocast(x.device.type, enabled=False):
+        x = x.to(weight.dtype)
+        return torch.cat([(x[i : i + ROWS] @ weight.T + bias).argmax(dim=1)
+                          for i in range(0, len(x), ROWS)])  # fmt: skip
