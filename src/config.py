@@ -171,8 +171,9 @@ def checked(config: DictConfig) -> DictConfig:
         )
     if typed.data.name == "folder":
         for split in ("train", "val", "test"):
-            names = typed.data[split]
-            if not isinstance(names, str) and not all(isinstance(n, str) for n in names or [0]):
+            names = plain["data"].get(split, [])
+            listed = [names] if isinstance(names, str) else names
+            if not isinstance(listed, list) or not all(isinstance(name, str) for name in listed):
                 raise ConfigError(f"data.{split} must be file names or patterns; got {names}")
     if typed.seed >= 2**32:
         raise ConfigError(f"seed must be below {2**32}; got {typed.seed}")

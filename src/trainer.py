@@ -26,6 +26,8 @@ def build_trainer(config: DictConfig, folder: Path, *callbacks: Callback) -> L.T
     quiet()
     torch.set_num_threads(config.trainer.threads or torch.get_num_threads())
     torch.set_flush_denormal(True)  # tiny probabilities would slow the softmax down tenfold
+    # `deterministic` below would also fill every new tensor with NaN; nothing here reads one unset
+    torch.utils.deterministic.fill_uninitialized_memory = False
     asked = config.trainer
     keep = {"dirpath": folder / "checkpoints", "enable_version_counter": False}
     try:

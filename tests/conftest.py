@@ -11,11 +11,11 @@ import trimesh
 from src.geometry.mesh import Mesh
 from tests.meshes import bumpy_sphere
 
-TOY_SPLIT = {"train": 6, "val": 2, "test": 2}
+TOY_SPLIT = {"train": 6, "val": 3, "test": 3}
 
 
 def toy_shapes() -> dict[str, Mesh]:
-    """A template of 162 vertices, and ten smooth deformations of it, by file name."""
+    """A template of 162 vertices, and twelve smooth deformations of it, by file name."""
     template = bumpy_sphere(7, subdivisions=2, bump=0.6)
     shapes = {"template.ply": template}
     for split, count in TOY_SPLIT.items():

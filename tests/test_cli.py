@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import signal
 import sys
 
@@ -10,6 +11,7 @@ import torch
 from hydra.core.global_hydra import GlobalHydra
 from omegaconf import OmegaConf
 
+from src.cli import job_folder
 from src.config import ConfigError
 from src.train import main
 from tests.test_train import FIGURES, ROOT, composed
@@ -97,8 +99,9 @@ def test_every_way_of_giving_metric(override, expected):
     assert composed([override] if override else []).model.metric is expected
 
 
-def test_an_experiment_may_set_metric_and_the_command_line_may_still_say_it():
-    assert composed(["model.metric=true", "+metric=false"]).model.metric is True
+def test_the_root_metric_wins_over_what_an_experiment_sets_of_the_model():
+    assert composed(["model.metric=true", "+metric=false"]).model.metric is False
+    assert composed(["model.metric=false", "+metric=true"]).model.metric is True
 
 
 @pytest.mark.parametrize(
@@ -116,6 +119,12 @@ def test_an_experiment_may_set_metric_and_the_command_line_may_still_say_it():
         (["model.metric_layers=some"], "model.metric_layers must be one of all, first; got some"),
         (["+model.depth=3"], "unknown key model.depth"),
         (["optim.lr=-1"], "optim.lr must be above 0; got -1"),
+        (["optim.betas=[2,3]"], "optim.betas must be two numbers in 0..1"),
+        (["optim.betas=[0.9]"], "optim.betas must be two numbers in 0..1"),
+        (["optim=5"], "optim is a group of settings; got 5"),
+        (["data.shot=5"], "data.shot is a group of settings; got 5"),
+        (["data=folder", "data.train=5"], "data.train must be file names or patterns; got 5"),
+        (["optim.epochs=1", "trainer.val_every=2"], "trainer.val_every must be at most"),
         (["optim.epochs=0"], "optim.epochs must be at least 1; got 0"),
         (["data.shot.radius=0"], "data.shot.radius must be above 0"),
         (["data.shuffle_vertices=perhaps"], "data.shuffle_vertices=perhaps: Value 'perhaps'"),
@@ -187,6 +196,27 @@ def test_a_failing_job_of_a_sweep_says_why_in_its_log_and_the_others_run(
     assert "error: optim.lr must be above 0; got 0" in (failed / "train.log").read_text()
     assert (done / "metrics.json").is_file() and not (failed / "metrics.json").exists()
     assert "Traceback" not in out + err
+
+
+def test_jobs_never_share_a_folder(monkeypatch):
+    """Also where a name had to lose what tells two of them apart."""
+    values = ["[train/*.ply]", "[train/?.ply]", "/a/b", "a/b", "x" * 300, "x" * 301, "1", "2"]
+    monkeypatch.setattr(sys, "argv", ["src.train", "-m", "seq_len=8", "data.root=1,2"])
+    names = [job_folder(["seq_len=8", f"data.root={value}"], 0) for value in values]
+    assert len(set(names)) == len(values)
+    assert names[-2:] == ["data.root-1", "data.root-2"]
+    assert all(re.fullmatch(r"[\w.+-]{1,130}", name) for name in names)
+    assert job_folder(["seq_len=8"], 3) == "3"
+
+
+def test_a_folder_with_another_run_is_left_alone(cli, toy_overrides, tmp_path):
+    folder = [*toy_overrides, "hydra.run.dir=run"]
+    assert cli(*folder, *QUICK)[0] == 0
+    before = (tmp_path / "run" / "config.yaml").read_text()
+    code, out, err = cli(*folder, *QUICK, "seed=7")
+    assert code == 1 and "run holds another run (seed differ)" in out + err
+    assert (tmp_path / "run" / "config.yaml").read_text() == before
+    assert cli(*folder, *QUICK)[0] == 0  # the same run again: nothing left to do
 
 
 def test_config_errors_name_the_key():

@@ -7,7 +7,7 @@ import torch
 from src.data.reference import BLOCK, ReferenceDistances
 from src.data.store import Store
 from src.geometry.geodesics import GeodesicSolver, diameter
-from src.geometry.mesh import Mesh
+from src.geometry.mesh import Mesh, MeshError
 from src.metrics import THRESHOLDS, CorrespondenceError, correspondence_curve, geodesic_errors
 from tests.meshes import bumpy_sphere, lattice, union
 
@@ -35,6 +35,24 @@ def test_between_components_there_is_no_distance():
     mesh = union(icosphere(1), icosphere(1))
     row = GeodesicSolver(mesh).row(0)
     assert np.isfinite(row[:42]).all() and np.isinf(row[42:]).all()
+
+
+def test_a_vertex_without_a_face_is_at_no_distance_from_any_other():
+    sphere = icosphere(1)
+    for at in (0, 7, 42):
+        vertices = np.insert(sphere.vertices, at, [9, 9, 9], axis=0)
+        mesh = Mesh(vertices, sphere.faces + (sphere.faces >= at))
+        solver = GeodesicSolver(mesh)
+        other = 5 if at != 5 else 6
+        row = solver.row(other)
+        assert np.isinf(row[at]) and np.isfinite(np.delete(row, at)).all()
+        assert solver.row(at)[at] == 0 and np.isinf(np.delete(solver.row(at), at)).all()
+        assert diameter(mesh) == pytest.approx(diameter(sphere), rel=0.01)
+
+
+def test_a_mesh_without_area_has_no_distances():
+    with pytest.raises(MeshError, match="no surface area"):
+        GeodesicSolver(Mesh([[0, 0, 0], [1, 0, 0], [2, 0, 0]], [[0, 1, 2]], "flat"))
 
 
 @pytest.fixture
@@ -65,6 +83,17 @@ def test_only_the_rows_that_are_asked_for_are_computed_and_they_are_kept(referen
     again(np.array([3]), np.array([9]))
     again(np.array([600]), np.array([600]))  # no distance needed
     assert len(computed) == BLOCK
+
+
+def test_memory_for_distances_is_bounded(reference, monkeypatch):
+    monkeypatch.setattr("src.data.reference.IN_MEMORY", 1)
+    rng = np.random.default_rng(1)
+    sources, targets = rng.integers(0, 642, (2, 50))
+    few = reference(sources, targets)
+    assert len(reference._blocks) == 1
+    monkeypatch.setattr("src.data.reference.IN_MEMORY", 2**30)
+    np.testing.assert_array_equal(reference(sources, targets), few)
+    assert len(reference._blocks) == 3
 
 
 def test_a_pair_on_two_components_counts_as_the_diameter(tmp_path):

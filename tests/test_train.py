@@ -10,6 +10,7 @@ import sys
 import time
 from pathlib import Path
 
+import lightning as L
 import numpy as np
 import pytest
 import torch
@@ -17,12 +18,12 @@ from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 
 from src import train as program
-from src.callbacks import Speed, WholeFiles
+from src.callbacks import Checkpoint, Speed, WholeFiles
 from src.cli import CONF, run_folder
 from src.config import checked
 from src.correspondence import Correspondence
 from src.data.sources import open_data
-from src.runs import BEST, CONFIG, LAST, METRICS, RunError, Stopped, continued, claim
+from src.runs import BEST, CONFIG, LAST, METRICS, RunError, Stopped, claim, continued
 
 ROOT = Path(CONF).parent
 
@@ -128,6 +129,46 @@ def test_geodesic_errors_over_area_and_over_diameter_have_one_ratio(whole_run):
     assert ratio == pytest.approx(data.reference.diameter, rel=1e-5)
 
 
+def test_validation_figures_are_of_one_epoch_and_all_its_meshes(whole_run):
+    """Those that last.ckpt brings, from its weights by a fresh module."""
+    folder, _ = whole_run
+    config = OmegaConf.to_container(OmegaConf.load(folder / CONFIG))
+    data = open_data(config)
+    data.prepare(["val"])
+    module = Correspondence(config, data.in_features, data.num_classes)
+    trainer = L.Trainer(accelerator="cpu", logger=False, enable_progress_bar=False)
+    checkpoint = torch.load(folder / LAST, weights_only=True)
+    module.load_state_dict(checkpoint["state_dict"])
+    trainer.validate(module, datamodule=data)
+    saved, _ = checkpoint["validation"]
+    assert module.figures["val"] == pytest.approx(saved)
+
+
+def test_the_learning_rate_warms_up_and_follows_half_a_cosine(whole_run):
+    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+    config = OmegaConf.load(whole_run[0] / CONFIG).optim
+    steps, warmup = 24, round(config.warmup * 24)
+    events = EventAccumulator(str(whole_run[0])).Reload().Scalars("lr-Adam")
+    assert len(events) >= 2
+    for event in events:
+        done = (event.step - warmup) / (steps - warmup)
+        shape = (event.step + 1) / warmup if done < 0 else 0.5 * (1 + np.cos(np.pi * done))
+        assert event.value == pytest.approx(config.lr * shape, rel=1e-5)
+
+
+def test_dropout_differs_between_meshes_and_epochs_and_not_between_runs(toy_overrides):
+    config = OmegaConf.to_container(composed(toy_overrides))
+    module = Correspondence(config, 160, 162)
+
+    def draw(mesh):
+        module.on_train_batch_start({"index": mesh}, 0)
+        return torch.rand(1).item()
+
+    assert len({draw(mesh) for mesh in range(5)}) == 5
+    assert draw(2) == draw(2)
+
+
 # ---------------------------------------------------------------------------------- repeatability
 
 
@@ -175,6 +216,7 @@ def test_a_stopped_run_goes_on_as_if_it_had_not_been(
     assert same_weights(whole_run[0], tmp_path)
     for name in FIGURES - {"seconds/preprocess", "seconds/train"}:
         assert metrics[name] == whole_run[1][name]
+    assert metrics["seconds/train"] >= saved["callbacks"]["Speed"]["seconds"]
 
 
 def program_process(overrides, folder) -> subprocess.Popen:
@@ -244,6 +286,45 @@ def test_a_checkpoint_that_cannot_be_written_leaves_the_last_one(tmp_path, monke
         io.save_checkpoint({"a": torch.zeros(3)}, tmp_path / "last.ckpt")
     assert torch.load(tmp_path / "last.ckpt", weights_only=True)["a"].sum() == 3
     assert [p.name for p in tmp_path.iterdir()] == ["last.ckpt"]
+
+
+def test_a_damaged_checkpoint_is_one_message(whole_run, toy_overrides, tmp_path):
+    folder, _ = whole_run
+    config = composed(toy_overrides)
+    for damage, message in [(lambda b: b[:-500], "is damaged"), (lambda b: b"no", "is damaged")]:
+        (tmp_path / "checkpoints").mkdir(exist_ok=True)
+        (tmp_path / LAST).write_bytes(damage((folder / LAST).read_bytes()))
+        with pytest.raises(RunError, match=message):
+            program.train(config, tmp_path)
+    (tmp_path / LAST).write_bytes((folder / LAST).read_bytes())
+    with pytest.raises(RunError, match="is of another run: its seq_len is 8"):
+        program.train(composed([*toy_overrides, "seq_len=9"]), tmp_path)
+
+
+def test_a_run_folder_that_was_moved_keeps_its_best_checkpoint(whole_run, tmp_path):
+    callbacks = torch.load(whole_run[0] / LAST, weights_only=True)["callbacks"]
+    [state] = [s for key, s in callbacks.items() if "val/geodesic_error" in key]
+    assert Path(state["best_model_path"]) == whole_run[0] / BEST
+    moved = Checkpoint(tmp_path / "checkpoints", "best", monitor="val/geodesic_error")
+    moved.load_state_dict(state)
+    assert moved.best_model_score == state["best_model_score"] < 1
+    here = str(tmp_path / BEST)
+    assert moved.best_model_path == moved.kth_best_model_path == here
+    assert moved.best_k_models == {here: state["best_model_score"]}
+
+
+def test_two_processes_measure_what_one_does(toy_overrides, tmp_path):
+    """Three meshes on two processes: every mesh counts once."""
+    shared = subprocess.run(
+        [sys.executable, "-m", "src.train", *toy_overrides, "trainer=ddp", "optim.epochs=2",
+         "trainer.accelerator=cpu", "trainer.devices=2", f"hydra.run.dir={tmp_path}"],
+        cwd=ROOT, capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    assert shared.returncode == 0, shared.stdout + shared.stderr
+    together = json.loads((tmp_path / METRICS).read_text())
+    alone = run(tmp_path, [*toy_overrides, "optim.epochs=2"])
+    for name in sorted(FIGURES - {"seconds/preprocess", "seconds/train"}):
+        assert together[name] == pytest.approx(alone[name], rel=1e-5), name
 
 
 def test_resume_takes_the_runs_config_and_only_harmless_changes(tmp_path, toy_overrides):

@@ -139,7 +139,9 @@ def test_training_draws_anew_in_every_iteration_and_validation_never(store):
 def test_one_seed_one_run_and_another_another(store):
     a, b, c = (served(serve(store, seed=seed))["train"] for seed in (3, 3, 4))
     assert all(x[0] == y[0] and torch.equal(x[1], y[1]) for x, y in zip(a, b, strict=True))
-    assert any(x[0] != y[0] or not torch.equal(x[1], y[1]) for x, y in zip(a, c, strict=True))
+    assert [x[0] for x in a] != [x[0] for x in c]  # the order, and for each mesh the spirals
+    spirals = [{index: drawn for index, drawn, epoch in s if epoch == 0} for s in (a, c)]
+    assert not any(torch.equal(spirals[0][i], spirals[1][i]) for i in range(6))
 
 
 def test_a_sampler_that_skips_goes_on_where_it_was():
@@ -148,6 +150,15 @@ def test_a_sampler_that_skips_goes_on_where_it_was():
         whole.set_epoch(epoch), rest.set_epoch(epoch)
         skipped = 4 if epoch == 2 else 0
         assert list(rest) == list(whole)[skipped:]
+
+
+@pytest.mark.parametrize("size, world", [(6, 2), (7, 2), (10, 4)])
+def test_processes_divide_an_epoch_among_them(size, world):
+    samplers = [EpochSampler(size, 5, rank=rank, world=world) for rank in range(world)]
+    parts = [list(sampler) for sampler in samplers]
+    assert {len(part) for part in parts} == {len(samplers[0])} == {-(-size // world)}
+    served = [i for part in parts for i in part]
+    assert set(served) == set(range(size)) and len(served) - size < world
 
 
 # -------------------------------------------------------------------------------- the numbering
@@ -205,6 +216,8 @@ def test_keys_depend_on_content_and_code_and_not_on_the_name(monkeypatch):
     assert descriptor_task(named, RECIPE).key == descriptor_task(mesh, RECIPE).key
     assert descriptor_task(moved, RECIPE).key != descriptor_task(mesh, RECIPE).key
     assert spiral_task(moved, RECIPE).key == spiral_task(mesh, RECIPE).key
+    fewer = Mesh(mesh.vertices, mesh.faces[1:])
+    assert descriptor_task(fewer, RECIPE).key != descriptor_task(mesh, RECIPE).key
     before = [task(mesh, RECIPE).key for task in (descriptor_task, spiral_task)]
     monkeypatch.setattr(preprocessing, "code_version", lambda *modules: "another")
     after = [task(mesh, RECIPE).key for task in (descriptor_task, spiral_task)]
@@ -231,7 +244,7 @@ def test_the_pool_computes_what_one_process_computes(tmp_path, monkeypatch):
         preprocessing, "_run_in_pool", lambda *a: started.append(len(a[0])) or run_in_pool(*a)
     )
     data.prepare()
-    assert started == [8]
+    assert started == [10]
     for split in TOY_SPLIT:
         for a, b in zip(data.datasets[split].items, alone.datasets[split].items, strict=True):
             assert torch.equal(a["features"], b["features"])

@@ -60,6 +60,16 @@ def damage_foreign(path):
     np.savez(path, key=np.array("another"), a=np.zeros(3))
 
 
+def damage_another_array(path):
+    np.savez(path, key=np.array(["key", "a", "b"]), a=np.zeros(3), c=np.zeros(3))
+
+
+def damage_encrypted(path):
+    data = bytearray(path.read_bytes())
+    data[data.index(b"PK\x01\x02") + 8] |= 1  # the flag of an encrypted member
+    path.write_bytes(data)
+
+
 def damage_keyless(path):
     np.savez(path, a=np.zeros(3))
 
@@ -81,6 +91,7 @@ def damage_zip(path):
 @pytest.mark.parametrize(
     "damage",
     [damage_truncate, damage_empty, damage_text, damage_bit, damage_foreign, damage_keyless,
+        damage_another_array, damage_encrypted,
      damage_npy, damage_pickle, damage_zip],
 )  # fmt: skip
 def test_a_damaged_or_foreign_file_is_computed_again_with_a_warning(store, damage, caplog):
@@ -124,17 +135,19 @@ def write_often(root, value):
         store.save("kind", "key", {"a": np.full(5000, value)})
 
 
-def test_two_processes_may_write_one_key(store):
+def test_two_processes_may_write_one_key(store, caplog):
     context = multiprocessing.get_context("spawn")
     writers = [context.Process(target=write_often, args=(store.root, v)) for v in (1, 2)]
     for writer in writers:
         writer.start()
     seen = []
+    caplog.set_level(logging.WARNING)
     while any(writer.is_alive() for writer in writers):
         if (arrays := store.load("kind", "key")) is not None:
             seen.append(set(arrays["a"].tolist()))
     assert all(writer.exitcode == 0 for writer in writers)
     assert store.load("kind", "key") is not None and all(len(values) == 1 for values in seen)
+    assert seen and "damaged" not in caplog.text
     assert [p.name for p in store.root.rglob("*") if p.is_file()] == ["key.npz"]
 
 

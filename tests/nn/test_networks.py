@@ -97,3 +97,28 @@ def test_the_forget_gate_begins_open():
     layer = LSTMNet(10, 21).spiral_layers[0]
     i, f, g, o = layer.input.bias.chunk(4)
     assert (f == 1).all() and not any(gate.any() for gate in (i, g, o))
+
+
+@pytest.mark.parametrize("name", ["fcs", "lstm"])
+def test_a_network_is_the_stack_of_its_layers_with_relu_between(name, batch):
+    features, spirals, _ = batch
+    net = make(name, feature_scale=3.0).eval()
+    x = torch.relu(net.lift(3.0 * features))
+    for layer in net.spiral_layers:
+        x = torch.relu(layer(x, spirals))
+    x = torch.relu(net.neck(x))
+    torch.testing.assert_close(net.embed(features, spirals), x)
+    torch.testing.assert_close(net(features, spirals), net.head(x))
+
+
+def test_dropout_follows_the_first_and_the_last_dense_layer(batch):
+    features, spirals, _ = batch
+    net = make("fcs", dropout=0.9)
+    with torch.no_grad():
+        for layer in (net.lift, net.neck):
+            layer.bias.fill_(100.0)  # nothing but dropout makes zeros
+        inputs = []
+        net.spiral_layers[0].register_forward_hook(lambda m, args, out: inputs.append(args[0]))
+        out = net.embed(features, spirals)
+    for x in (inputs[0], out):
+        assert (x == 0).float().mean() == pytest.approx(0.9, abs=0.05)
