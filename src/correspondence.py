@@ -62,8 +62,7 @@ class Correspondence(L.LightningModule):
     def on_train_batch_start(self, batch: Batch, batch_idx: int) -> None:
         # Dropout depends on seed, epoch and mesh alone, as all other chance does: a run that was
         # stopped anywhere goes on as if it had not been.
-        seed = derived_seed(self.seed, "dropout", self.current_epoch, batch["index"])
-        torch.manual_seed(seed % 2**63)
+        torch.manual_seed(derived_seed(self.seed, "dropout", self.current_epoch, batch["index"]))
 
     def training_step(self, batch: Batch, batch_idx: int) -> Tensor:
         head = self.net.head

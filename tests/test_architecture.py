@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import re
 from pathlib import Path
 
 import pytest
@@ -70,3 +71,17 @@ def test_a_wrong_import_is_found():
 @pytest.mark.parametrize("path", MODULES, ids=lambda path: str(path.relative_to(SRC)))
 def test_modules_stay_small(path):
     assert len(path.read_text().splitlines()) <= 300
+
+
+README = (SRC.parent / "README.md").read_text()
+
+
+def test_what_the_readme_links_to_is_there():
+    links = re.findall(r"\]\((?!http)([^)]+)\)", README)
+    assert len(links) >= 2
+    assert [link for link in links if not (SRC.parent / link).exists()] == []
+    assert not re.search(r"\b(TODO|TABLE|MINUTES|ROWS)\b", README)
+
+
+def test_the_readme_has_a_line_for_every_module():
+    assert [path.name for path in MODULES if path.name not in README] == []
