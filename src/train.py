@@ -5,9 +5,11 @@ from __future__ import annotations
 import logging
 import shlex
 import time
+from functools import partial
 from pathlib import Path
 
 from omegaconf import DictConfig, OmegaConf
+from tqdm import tqdm
 
 from src.cli import entry_point
 from src.config import checked
@@ -22,6 +24,8 @@ def main(config: DictConfig) -> None:
 
     hydra = HydraConfig.get()
     folder = Path(hydra.runtime.output_dir)
+    if folder.is_relative_to(Path.cwd()):  # shorter to read, and to type
+        folder = folder.relative_to(Path.cwd())
     if config.resume:
         folder = Path(config.resume)
         config = checked(continued(config, list(hydra.overrides.task)))
@@ -81,12 +85,16 @@ def train(config: DictConfig, folder: Path) -> dict[str, float]:
         trainer.logger.log_hyperparams(flat(plain), tested)
         trainer.logger.finalize("success")
         write_metrics(folder, metrics)
-        summary.draw_curve(folder / "curve.png", module)
+        pictures = {"curve.png": partial(summary.draw_curve, module=module)}
         if config.picture:
+            pictures["correspondence.png"] = partial(
+                summary.draw_shapes, data=data, predictions=module.predictions
+            )
+        for name, draw in tqdm(pictures.items(), desc="Pictures", leave=False, delay=1.0):
             try:
-                summary.draw_shapes(folder / "correspondence.png", data, module.predictions)
+                draw(folder / name)
             except RenderError as error:
-                log.warning("no correspondence.png: %s", error)
+                log.warning("no %s: %s", name, error)
         log.info(summary.table(folder, data, metrics))
     return metrics
 
