@@ -144,7 +144,7 @@ def checked(config: DictConfig) -> DictConfig:
         plain["model"]["metric"] = plain["metric"]  # the root key wins over an experiment's
     elif plain["model"].get("metric") is None:
         plain["model"]["metric"] = False
-    for key, value in _leaves(plain):
+    for key, value in flat(plain).items():
         try:
             OmegaConf.update(typed, key, value)
         except OmegaConfBaseException as error:
@@ -186,12 +186,15 @@ def checked(config: DictConfig) -> DictConfig:
     return typed
 
 
-def _leaves(tree: dict[str, Any], prefix: str = ""):
+def flat(tree: dict[str, Any], prefix: str = "") -> dict[str, Any]:
+    """{"a": {"b": 1}} as {"a.b": 1}."""
+    leaves: dict[str, Any] = {}
     for key, value in tree.items():
         if isinstance(value, dict):
-            yield from _leaves(value, f"{prefix}{key}.")
+            leaves |= flat(value, f"{prefix}{key}.")
         else:
-            yield prefix + key, value
+            leaves[prefix + key] = value
+    return leaves
 
 
 def _known(given: dict[str, Any], schema: type, prefix: str) -> None:

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
+
+from src.config import flat
 
 CONFIG, METRICS = "config.yaml", "metrics.json"
 BEST, LAST = "checkpoints/best.ckpt", "checkpoints/last.ckpt"
@@ -54,7 +55,7 @@ def claim(folder: Path, config: DictConfig) -> None:
 
 def differences(config: DictConfig, stored: DictConfig) -> list[str]:
     """The keys in which two configs would make two different runs."""
-    one, two = (dict(_leaves(OmegaConf.to_container(c, resolve=True))) for c in (config, stored))
+    one, two = (flat(OmegaConf.to_container(c, resolve=True)) for c in (config, stored))
     keys = [key for key in one.keys() | two.keys() if key != "resume" and not _may_change(key)]
     return sorted(key for key in keys if one.get(key) != two.get(key))
 
@@ -108,14 +109,6 @@ def _load(folder: Path) -> DictConfig:
 
 def _may_change(key: str) -> bool:
     return any(key == free or key.startswith(free + ".") for free in MAY_CHANGE)
-
-
-def _leaves(tree: dict[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
-    for key, value in tree.items():
-        if isinstance(value, dict):
-            yield from _leaves(value, f"{prefix}{key}.")
-        else:
-            yield prefix + key, value
 
 
 def _plain(config: DictConfig, key: str) -> Any:

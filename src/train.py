@@ -12,7 +12,7 @@ from omegaconf import DictConfig, OmegaConf
 from tqdm import tqdm
 
 from src.cli import entry_point
-from src.config import checked
+from src.config import checked, flat
 from src.runs import BEST, LAST, RunError, Stopped, claim, continued, write_metrics
 
 log = logging.getLogger("src.train")
@@ -132,17 +132,6 @@ def describe(config: DictConfig, data, parameters: int, precision: str, seconds:
     )
     megabytes = data.store.size() / 1e6
     yield f"cache: {data.store.root}, {megabytes:.0f} MB; ready after {seconds:.1f} s"
-
-
-def flat(tree: dict, prefix: str = "") -> dict[str, object]:
-    """{"a": {"b": 1}} as {"a.b": 1}."""
-    leaves: dict[str, object] = {}
-    for key, value in tree.items():
-        if isinstance(value, dict):
-            leaves |= flat(value, f"{prefix}{key}.")
-        else:
-            leaves[prefix + key] = value
-    return leaves
 
 
 if __name__ == "__main__":

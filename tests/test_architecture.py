@@ -17,7 +17,7 @@ ALLOWED = {
     "data": {"data", "geometry"},
     "metrics": set(),
     "figures": {"geometry"},
-    "runs": set(),
+    "runs": {"config"},
     "config": set(),
     "callbacks": {"runs"},
     "correspondence": {"data", "nn", "metrics", "figures"},
