@@ -6,7 +6,7 @@ import difflib
 from dataclasses import dataclass, field, fields
 from typing import Any
 
-from omegaconf import MISSING, DictConfig, OmegaConf
+from omegaconf import MISSING, DictConfig, ListConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 
@@ -131,7 +131,7 @@ def checked(config: DictConfig) -> DictConfig:
         if not OmegaConf.is_dict(node):
             raise ConfigError(f"{group} is a group of settings; got {node}")
     for group, schemas in (("model", MODELS), ("data", DATASETS)):
-        name = plain.get(group, {}).get("name")
+        name = plain[group].get("name")
         if name not in schemas:
             raise ConfigError(f"{group}.name must be one of {', '.join(schemas)}; got {name}")
         _known(plain[group], schemas[name], f"{group}.")
@@ -150,6 +150,11 @@ def checked(config: DictConfig) -> DictConfig:
         except OmegaConfBaseException as error:
             reason = str(error).splitlines()[0]
             raise ConfigError(f"{key}={value}: {reason}") from error
+    _check_ranges(typed)
+    return typed
+
+
+def _check_ranges(typed: DictConfig) -> None:
     for key, least in AT_LEAST.items():
         value = OmegaConf.select(typed, key)
         if value is not None and value < least:
@@ -171,9 +176,10 @@ def checked(config: DictConfig) -> DictConfig:
         )
     if typed.data.name == "folder":
         for split in ("train", "val", "test"):
-            names = plain["data"].get(split, [])
+            names = typed.data[split]
             listed = [names] if isinstance(names, str) else names
-            if not isinstance(listed, list) or not all(isinstance(name, str) for name in listed):
+            is_list = isinstance(listed, list | ListConfig)
+            if not is_list or not all(isinstance(name, str) for name in listed):
                 raise ConfigError(f"data.{split} must be file names or patterns; got {names}")
     if typed.seed >= 2**32:
         raise ConfigError(f"seed must be below {2**32}; got {typed.seed}")
@@ -183,7 +189,6 @@ def checked(config: DictConfig) -> DictConfig:
         )
     if not 0 <= typed.model.dropout < 1:
         raise ConfigError(f"model.dropout must be in 0..1, 1 left out; got {typed.model.dropout}")
-    return typed
 
 
 def flat(tree: dict[str, Any], prefix: str = "") -> dict[str, Any]:

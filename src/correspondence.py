@@ -100,7 +100,7 @@ class Correspondence(L.LightningModule):
         self.figures[split] = {f"{split}/{name}": float(value) for name, value in values.items()}
         # already over all meshes of all ranks, so nothing is left to average
         self.log_dict(self.figures[split], batch_size=1, sync_dist=True)
-        if self.logger is not None and not self.trainer.sanity_checking:
+        if self.logger is not None:
             figure = curve_figure({split: (THRESHOLDS, self.curves[split])})
             self.logger.experiment.add_figure(f"{split}/curve", figure, self.current_epoch)
 
