@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import math
 from dataclasses import dataclass, field, fields
 from typing import Any
 
@@ -18,15 +19,32 @@ class ConfigError(ValueError):
 class Model:
     name: str = MISSING
     channels: list[int] = MISSING
-    metric: bool = False
-    metric_layers: str = "all"
     dropout: float = 0.3
     feature_scale: float = 1.0
 
 
 @dataclass
-class LSTM(Model):
+class FCS(Model):
+    metric: bool = False
+    metric_layers: str = "all"
+
+
+@dataclass
+class LSTM(FCS):
     rings: int | None = None
+
+
+@dataclass
+class Patch:
+    radius: float = MISSING
+    rings: int = 5
+    rays: int = 16
+    weights: str = "interpolation"
+
+
+@dataclass
+class GCNN3(Model):
+    patch: Patch = field(default_factory=Patch)
 
 
 @dataclass
@@ -104,17 +122,19 @@ class Train:
     picture: bool = True
 
 
-MODELS = {"fcs": Model, "lstm": LSTM}
+MODELS = {"fcs": FCS, "lstm": LSTM, "gcnn3": GCNN3}
 DATASETS = {"bodies": Bodies, "faust": Faust, "faust_benchmark": FaustBenchmark, "folder": Folder}
 
 AT_LEAST = {
     "seq_len": 1, "seed": 0, "optim.epochs": 1, "optim.warmup": 0, "data.workers": 1,
-    "data.shot.bins": 1, "model.rings": 1, "trainer.threads": 1, "trainer.val_every": 1,
+    "data.shot.bins": 1, "model.rings": 1, "model.patch.rings": 1, "trainer.threads": 1,
+    "trainer.val_every": 1,
 }  # fmt: skip
-ABOVE_ZERO = ("optim.lr", "data.shot.radius", "model.feature_scale")
+ABOVE_ZERO = ("optim.lr", "data.shot.radius", "model.feature_scale", "model.patch.radius")
 ONE_OF = {
     "optim.schedule": ("cosine", "constant"),
     "model.metric_layers": ("all", "first"),
+    "model.patch.weights": ("interpolation", "gaussian"),
     "trainer.precision": ("32", "64", "bf16", "auto"),
 }
 
@@ -126,11 +146,8 @@ def checked(config: DictConfig) -> DictConfig:
     """
     typed = OmegaConf.structured(Train)
     plain = OmegaConf.to_container(config, resolve=True)
-    for group in ("model", "data", "trainer", "optim", "data.shot"):
-        node = OmegaConf.select(config, group)
-        if not OmegaConf.is_dict(node):
-            raise ConfigError(f"{group} is a group of settings; got {node}")
     for group, schemas in (("model", MODELS), ("data", DATASETS)):
+        _is_group(plain[group], group)
         name = plain[group].get("name")
         if name not in schemas:
             raise ConfigError(f"{group}.name must be one of {', '.join(schemas)}; got {name}")
@@ -140,10 +157,18 @@ def checked(config: DictConfig) -> DictConfig:
     _known(plain["trainer"], Trainer, "trainer.")
     _known(plain["optim"], Optim, "optim.")
     _known(plain["data"]["shot"], Shot, "data.shot.")
-    if plain.get("metric") is not None:
-        plain["model"]["metric"] = plain["metric"]  # the root key wins over an experiment's
-    elif plain["model"].get("metric") is None:
-        plain["model"]["metric"] = False
+    if "patch" in typed.model:
+        _known(plain["model"]["patch"], Patch, "model.patch.")
+    if "metric" in typed.model:
+        if plain.get("metric") is not None:
+            plain["model"]["metric"] = plain["metric"]  # the root key wins over an experiment's
+        elif plain["model"].get("metric") is None:
+            plain["model"]["metric"] = False
+    elif plain.get("metric"):
+        raise ConfigError(
+            "metric=true needs a model with spirals, whose elements carry it; "
+            f"got model {plain['model']['name']}"
+        )
     for key, value in flat(plain).items():
         try:
             OmegaConf.update(typed, key, value)
@@ -160,10 +185,11 @@ def _check_ranges(typed: DictConfig) -> None:
         if value is not None and value < least:
             raise ConfigError(f"{key} must be at least {least}; got {value}")
     for key in ABOVE_ZERO:
-        if not OmegaConf.select(typed, key) > 0:
-            raise ConfigError(f"{key} must be above 0; got {OmegaConf.select(typed, key)}")
+        value = OmegaConf.select(typed, key)
+        if value is not None and not 0 < value < math.inf:
+            raise ConfigError(f"{key} must be above 0; got {value}")
     for key, values in ONE_OF.items():
-        if (value := OmegaConf.select(typed, key)) not in values:
+        if (value := OmegaConf.select(typed, key)) not in (None, *values):
             raise ConfigError(f"{key} must be one of {', '.join(values)}; got {value}")
     if typed.trainer.val_every > typed.optim.epochs:
         raise ConfigError(
@@ -187,6 +213,10 @@ def _check_ranges(typed: DictConfig) -> None:
         raise ConfigError(
             f"model.channels must hold three numbers of at least 1; got {typed.model.channels}"
         )
+    if "patch" in typed.model and (typed.model.patch.rays < 2 or typed.model.patch.rays % 2):
+        raise ConfigError(
+            f"model.patch.rays must be even and at least 2; got {typed.model.patch.rays}"
+        )
     if not 0 <= typed.model.dropout < 1:
         raise ConfigError(f"model.dropout must be in 0..1, 1 left out; got {typed.model.dropout}")
 
@@ -202,7 +232,13 @@ def flat(tree: dict[str, Any], prefix: str = "") -> dict[str, Any]:
     return leaves
 
 
-def _known(given: dict[str, Any], schema: type, prefix: str) -> None:
+def _is_group(given: Any, name: str) -> None:
+    if not isinstance(given, dict):
+        raise ConfigError(f"{name} is a group of settings; got {given}")
+
+
+def _known(given: Any, schema: type, prefix: str) -> None:
+    _is_group(given, prefix.removesuffix("."))
     names = [f.name for f in fields(schema)]
     for key in given:
         if key not in names:

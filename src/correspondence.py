@@ -13,20 +13,24 @@ from torch import Tensor, nn
 from src.data.datamodule import Batch, derived_seed
 from src.figures import curve_figure
 from src.metrics import THRESHOLDS, CorrespondenceError, geodesic_errors
+from src.nn.geodesic import Resampling
 from src.nn.layers import metric_features
 from src.nn.loss import linear_cross_entropy, predict
-from src.nn.networks import FCSNet, LSTMNet
+from src.nn.networks import GCNN3, FCSNet, LSTMNet
 
 
 def build_network(model: dict[str, Any], seq_len: int, in_features: int, num_classes: int):
     """The network that a model config describes. Its names are a closed list: a checkpoint's
     config can't name code to run."""
-    options = {k: v for k, v in model.items() if k not in ("name", "rings")}
+    options = {k: v for k, v in model.items() if k not in ("name", "rings", "patch")}
     if model["name"] == "fcs":
         return FCSNet(in_features, num_classes, seq_len, **options)
     if model["name"] == "lstm":
         return LSTMNet(in_features, num_classes, **options)
-    raise ValueError(f"model.name must be fcs or lstm, got {model['name']!r}")
+    if model["name"] == "gcnn3":
+        patch = model["patch"]
+        return GCNN3(in_features, num_classes, rings=patch["rings"], rays=patch["rays"], **options)
+    raise ValueError(f"model.name must be fcs, lstm or gcnn3, got {model['name']!r}")
 
 
 class Correspondence(L.LightningModule):
@@ -54,6 +58,8 @@ class Correspondence(L.LightningModule):
         self.distances = self.trainer.datamodule.reference
 
     def embed(self, batch: Batch) -> Tensor:
+        if "patches" in batch:
+            return self.net.embed(batch["features"], Resampling(**batch["patches"]))
         metric = None
         if self.net.metric:
             metric = metric_features(batch["vertices"], batch["spirals"], batch["unit"])

@@ -123,15 +123,22 @@ def describe(config: DictConfig, data, parameters: int, precision: str, seconds:
         f"{config.data.name}: {sizes[0]} meshes to train on, {sizes[1]} to validate, {sizes[2]} to "
         f"test; labels are the {data.num_classes} vertices of the template"
     )
-    rings = config.model.get("rings")
-    spirals = f"{rings} rings" if rings else f"{config.seq_len} vertices"
-    metric = "with" if config.model.metric else "without"
     yield (
-        f"{config.model.name}: {parameters:,} parameters, spirals of {spirals} {metric} metric "
-        f"information; {config.optim.epochs} epochs, {precision} on {config.trainer.accelerator}"
+        f"{config.model.name}: {parameters:,} parameters, {neighbourhoods(config)}; "
+        f"{config.optim.epochs} epochs, {precision} on {config.trainer.accelerator}"
     )
     megabytes = data.store.size() / 1e6
     yield f"cache: {data.store.root}, {megabytes:.0f} MB; ready after {seconds:.1f} s"
+
+
+def neighbourhoods(config: DictConfig) -> str:
+    """What the network sees around a vertex."""
+    if "patch" in config.model:
+        patch = config.model.patch
+        return f"patches of {patch.rings} x {patch.rays} samples, radius {patch.radius} diameters"
+    rings = config.model.get("rings")
+    spirals = f"{rings} rings" if rings else f"{config.seq_len} vertices"
+    return f"spirals of {spirals} {'with' if config.model.metric else 'without'} metric information"
 
 
 if __name__ == "__main__":

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 import signal
 import sys
@@ -84,6 +85,17 @@ def test_the_documented_sweep_works(cli, toy_overrides, tmp_path):
     assert FIGURES  # each run folder's contract has a test of its own
 
 
+def test_all_three_networks_in_one_sweep(cli, toy_overrides, tmp_path):
+    code, _, err = cli("-m", "model=lstm,fcs,gcnn3", *toy_overrides, *QUICK, "hydra.sweep.dir=s")
+    assert code == 0, err
+    kept = {path.parent.name: json.loads(path.read_text())
+            for path in (tmp_path / "s").glob("*/metrics.json")}  # fmt: skip
+    assert sorted(kept) == ["model-fcs", "model-gcnn3", "model-lstm"]
+    assert (
+        len({tuple(sorted(metrics)) for metrics in kept.values()}) == 1
+    )  # the same figures of all
+
+
 @pytest.mark.parametrize(
     "override, expected",
     [
@@ -110,7 +122,7 @@ def test_the_root_metric_wins_over_what_an_experiment_sets_of_the_model():
         (["+metric=maybe"], "metric=maybe: Value 'maybe' is not a valid bool"),
         (["seq_len=0"], "seq_len must be at least 1; got 0"),
         (["seq_len=many"], "seq_len=many: Value 'many' of type 'str' could not be converted"),
-        (["model=foo"], "Could not find 'model/foo'; there are: fcs, lstm"),
+        (["model=foo"], "Could not find 'model/foo'; there are: fcs, gcnn3, lstm"),
         (["data=foo"], "there are: bodies, bodies_6890, faust, faust_benchmark, folder"),
         (["+metrics=true"], "unknown key metrics; did you mean metric?"),
         (["+rate=1"], "unknown key rate; known: seq_len"),
@@ -119,6 +131,12 @@ def test_the_root_metric_wins_over_what_an_experiment_sets_of_the_model():
         (["model.metric_layers=some"], "model.metric_layers must be one of all, first; got some"),
         (["+model.depth=3"], "unknown key model.depth"),
         (["optim.lr=-1"], "optim.lr must be above 0; got -1"),
+        (["model=gcnn3", "+metric=true"], "metric=true needs a model with spirals"),
+        (["model=gcnn3", "model.patch.rays=15"], "model.patch.rays must be even and at least 2"),
+        (["model=gcnn3", "model.patch.radius=0"], "model.patch.radius must be above 0; got 0"),
+        (["model=gcnn3", "model.patch.weights=flat"], "must be one of interpolation, gaussian"),
+        (["model=gcnn3", "model.patch=null"], "model.patch is a group of settings; got None"),
+        (["model=gcnn3", "+model.patch.sectors=8"], "unknown key model.patch.sectors"),
         (["optim.betas=[2,3]"], "optim.betas must be two numbers in 0..1"),
         (["optim.betas=[0.9]"], "optim.betas must be two numbers in 0..1"),
         (["optim=5"], "optim is a group of settings; got 5"),
@@ -164,8 +182,8 @@ def test_a_device_that_is_not_there_is_one_clear_line(cli, toy_overrides, overri
 def test_help_shows_groups_root_keys_and_three_commands(cli):
     code, out, _ = cli("--help")
     assert code == 0
-    for word in ("model: fcs, lstm", "data: bodies", "trainer: cpu, ddp, gpu", "seq_len", "metric",
-                 "seed", "resume", "experiment"):  # fmt: skip
+    for word in ("model: fcs, gcnn3, lstm", "data: bodies", "trainer: cpu, ddp, gpu", "seq_len",
+                 "metric", "seed", "resume", "experiment"):  # fmt: skip
         assert word in out
     commands = [line.strip() for line in out.splitlines() if line.strip().startswith("python -m")]
     assert len(commands) >= 3

@@ -185,6 +185,13 @@ def test_two_runs_with_one_seed_agree_to_the_bit_and_another_seed_differs(
     assert not same_weights(folder, tmp_path / "other")
 
 
+@pytest.mark.parametrize("model", ["lstm", "gcnn3"])
+def test_so_do_runs_of_the_other_networks(model, toy_overrides, tmp_path):
+    for name in "ab":
+        run(tmp_path / name, [*toy_overrides, f"model={model}", "optim.epochs=2"])
+    assert same_weights(tmp_path / "a", tmp_path / "b")
+
+
 STEPS = 6  # an epoch of the toy data set has as many
 
 
@@ -360,6 +367,15 @@ def test_resume_of_what_is_no_run_is_one_message(tmp_path):
         ["model=lstm"],
         ["model=lstm", "metric=true"],
         ["model=lstm", "model.rings=1", "+metric=true"],
+        ["model=gcnn3"],
+        [
+            "model=gcnn3",
+            "model.patch.weights=gaussian",
+            "model.patch.rings=3",
+            "model.patch.rays=8",
+        ],
+        ["model=gcnn3", "trainer.precision=bf16"],
+        ["model=gcnn3", "trainer.precision=64"],
         ["metric=true"],
         ["metric=true", "model.metric_layers=first"],
         ["trainer.precision=bf16"],
@@ -385,6 +401,12 @@ def test_a_network_learns_and_the_numbering_does_not_help_it(toy_overrides, tmp_
     assert plain["test/exact_match"] > 0.6  # chance: 0.006
     assert shuffled["test/exact_match"] == pytest.approx(plain["test/exact_match"], abs=0.12)
     assert shuffled["test/geodesic_error"] == pytest.approx(plain["test/geodesic_error"], abs=0.06)
+
+
+def test_gcnn3_learns(toy_overrides, tmp_path):
+    gcnn3 = ["model=gcnn3", "model.patch.radius=0.2", "optim.lr=0.004"]
+    metrics = run(tmp_path, [*toy_overrides, *LEARN, *gcnn3])
+    assert metrics["test/exact_match"] > 0.5  # chance: 0.006
 
 
 def test_the_picture_is_drawn_without_a_display(toy_overrides, tmp_path, monkeypatch):

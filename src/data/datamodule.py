@@ -12,14 +12,22 @@ import torch
 from torch.utils.data import DataLoader, Dataset, Sampler
 from tqdm import tqdm
 
-from src.data.preprocessing import Recipe, descriptor_task, load_task, run_tasks, spiral_task
+from src.data.preprocessing import (
+    Recipe,
+    Task,
+    by_rows_and_columns,
+    descriptor_task,
+    load_task,
+    neighbourhood_task,
+    run_tasks,
+)
 from src.data.reference import ReferenceDistances
 from src.data.shapes import SPLITS, DataError, Shape, ShapeSet
 from src.data.store import Store, digest
 
 log = logging.getLogger(__name__)
 
-Batch = dict[str, torch.Tensor | int]
+Batch = dict[str, torch.Tensor | int | dict[str, torch.Tensor]]
 
 
 def derived_seed(*parts: int | str) -> int:
@@ -46,8 +54,8 @@ class MeshDataset(Dataset):
     """The tensors of one split. Item i is a dictionary, without a batch dimension:
 
     features float32 [V, C]; labels int64 [V]; vertices float32 [V, 3]; unit float32 [], the length
-    that metric information is divided by; sequences int32 [R, N] and first int64 [V+1], the spiral
-    table; index int, i.
+    that metric information is divided by; index int, i; and the neighbourhoods: either sequences
+    int32 [R, N] and first int64 [V+1], the spiral table, or patches, see `by_rows_and_columns`.
     """
 
     def __init__(self, names: list[str], items: list[Batch]):
@@ -88,10 +96,10 @@ class EpochSampler(Sampler[int]):
 
 
 class CorrespondenceData(L.LightningDataModule):
-    """A data set as batches of one mesh, with the spirals of this iteration.
+    """A data set as batches of one mesh, with the spirals of this iteration or with patches.
 
     Each batch is an item of `MeshDataset` on the device of the run, with `spirals` int64 [V, N]
-    in the place of the table. In training the start of every spiral is drawn anew in every
+    in the place of a spiral table. In training the start of every spiral is drawn anew in every
     iteration, from (seed, epoch, mesh) alone: an interrupted run goes on with the very draws it
     would have made. In validation and test it is drawn from (seed, mesh): figures are repeatable.
 
@@ -150,19 +158,19 @@ class CorrespondenceData(L.LightningDataModule):
         for _, name in tqdm(names, desc="Meshes", unit="mesh", delay=1.0):
             shape = self.shape(name)
             shapes.append(shape)
-            tasks.append(
-                (descriptor_task(shape.mesh, self.recipe), spiral_task(shape.mesh, self.recipe))
-            )
+            described = descriptor_task(shape.mesh, self.recipe)
+            tasks.append((described, neighbourhood_task(shape.mesh, self.recipe)))
+        kind = "Patches" if self.recipe.patch else "Spirals"
         run_tasks((t for t, _ in tasks), self.store, self.workers, "Descriptors")
-        run_tasks((t for _, t in tasks), self.store, self.workers, "Spirals")
-        loaded: dict[str, dict[str, torch.Tensor]] = {}  # meshes share the tables they have alike
+        run_tasks((t for _, t in tasks), self.store, self.workers, kind)
+        loaded: dict[str, Batch] = {}  # meshes share the spirals they have alike
         items: dict[str, list[Batch]] = {split: [] for split in wanted}
         progress = tqdm(zip(names, shapes, tasks, strict=True), total=len(names),
                         desc="Loading", unit="mesh", delay=1.0)  # fmt: skip
-        for (split, name), shape, (descriptors, spirals) in progress:
-            if spirals.key not in loaded:
-                loaded[spirals.key] = _tensors(load_task(spirals, self.store))
-            item = _tensors(load_task(descriptors, self.store)) | loaded[spirals.key]
+        for (split, name), shape, (descriptors, neighbourhoods) in progress:
+            if neighbourhoods.key not in loaded:
+                loaded[neighbourhoods.key] = self._neighbourhoods(neighbourhoods, shape)
+            item = _tensors(load_task(descriptors, self.store)) | loaded[neighbourhoods.key]
             if undefined := int(item.pop("undefined")):
                 log.warning("%s: no descriptor at %d of %d vertices; zeros stand there",
                             name, undefined, len(shape.labels))  # fmt: skip
@@ -174,6 +182,12 @@ class CorrespondenceData(L.LightningDataModule):
             items[split].append(item)
         for split in wanted:
             self.datasets[split] = MeshDataset(self.shapes.names[split], items[split])
+
+    def _neighbourhoods(self, task: Task, shape: Shape) -> Batch:
+        arrays = load_task(task, self.store)
+        if self.recipe.patch is None:
+            return _tensors(arrays)
+        return {"patches": _tensors(by_rows_and_columns(arrays, len(shape.labels)))}
 
     def train_dataloader(self) -> DataLoader:
         skip, self._skip = self._skip, 0
@@ -200,6 +214,8 @@ class CorrespondenceData(L.LightningDataModule):
         return (trainer.global_rank, trainer.world_size) if trainer is not None else (0, 1)
 
     def on_after_batch_transfer(self, batch: Batch, dataloader_idx: int) -> Batch:
+        if "sequences" not in batch:
+            return batch
         batch = dict(batch)
         trainer = self.trainer
         when = f"epoch {trainer.current_epoch}" if trainer.training else "evaluation"

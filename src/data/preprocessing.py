@@ -5,29 +5,47 @@ from __future__ import annotations
 import sys
 import time
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from dataclasses import astuple, dataclass
 
 import numpy as np
 from joblib import Parallel, cpu_count, delayed
+from scipy.sparse import csr_array
 from tqdm import tqdm
 
 from src.data.store import Arrays, Store, code_version, digest
-from src.geometry import connectivity, mesh, shot, spirals
+from src.geometry import connectivity, geodesics, mesh, patches, shot, spirals, windows
 from src.geometry.mesh import Mesh, MeshError
+
+WEIGHTS = ("interpolation", "gaussian")
+
+
+@dataclass(frozen=True)
+class PatchRecipe:
+    """The polar grid around every vertex.
+
+    radius: over the mesh's geodesic diameter. weights: how a sample is blended from vertices; by
+    "interpolation" in the triangle it lies in, or by the "gaussian" windows of the original.
+    """
+
+    radius: float
+    rings: int = 5
+    rays: int = 16
+    weights: str = "interpolation"
 
 
 @dataclass(frozen=True)
 class Recipe:
-    """What is computed of each mesh.
+    """What is computed of each mesh: its descriptors, and either spirals or patches.
 
     shot_radius: over the square root of the mesh's surface area. shot_bins: of the cosine.
-    seq_len or rings: one of them, see `spiral_table`; the other None.
+    seq_len or rings: of spirals, one of them, see `spiral_table`. patch: of patches.
     """
 
     shot_radius: float
     shot_bins: int
-    seq_len: int | None
+    seq_len: int | None = None
     rings: int | None = None
+    patch: PatchRecipe | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,6 +73,19 @@ def spiral_task(mesh_: Mesh, recipe: Recipe) -> Task:
     return Task("spirals", key, _spirals, (mesh_, recipe.seq_len, recipe.rings))
 
 
+def patch_task(mesh_: Mesh, recipe: Recipe) -> Task:
+    """`indices` int32 [E], `weights` float32 [E] and `first` int32 [S+1]: sample s is the sum over
+    k in first[s]:first[s+1] of weights[k] f[indices[k]]; samples by vertex, then ray, then ring."""
+    version = code_version(connectivity, geodesics, patches, windows, sys.modules[__name__])
+    key = digest(mesh_.vertices, mesh_.faces, *astuple(recipe.patch), version)
+    return Task("patches", key, _patches, (mesh_, recipe.patch))
+
+
+def neighbourhood_task(mesh_: Mesh, recipe: Recipe) -> Task:
+    """Spirals or patches, whichever the recipe asks for."""
+    return (patch_task if recipe.patch else spiral_task)(mesh_, recipe)
+
+
 def _descriptors(mesh_: Mesh, radius: float, bins: int) -> Arrays:
     if mesh_.area == 0:
         raise MeshError(f"{mesh_.name}: no surface area, so there is no scale to describe it at")
@@ -70,6 +101,34 @@ def _descriptors(mesh_: Mesh, radius: float, bins: int) -> Arrays:
 def _spirals(mesh_: Mesh, seq_len: int | None, rings: int | None) -> Arrays:
     table = spirals.spiral_table(mesh_, seq_len, rings=rings)
     return {"sequences": table.sequences, "first": table.first}
+
+
+def _patches(mesh_: Mesh, patch: PatchRecipe) -> Arrays:
+    grid = (patch.radius * geodesics.diameter(mesh_), patch.rings, patch.rays)
+    if patch.weights == "gaussian":
+        indices, weights, first = windows.gaussian_windows(mesh_, *grid)
+    else:
+        table = patches.geodesic_patches(mesh_, *grid)
+        whole = table.whole.ravel()
+        indices, weights = (array.reshape(-1, 3)[whole].ravel() for array in table)
+        first = 3 * np.concatenate([[0], np.cumsum(whole)])
+    samples = csr_array((weights, indices, first), shape=(len(first) - 1, len(mesh_.vertices)))
+    rows = np.arange(len(first) - 1).reshape(-1, patch.rings, patch.rays)
+    by_ray = samples[rows.transpose(0, 2, 1).ravel()]
+    return {"indices": by_ray.indices.astype(np.int32), "weights": by_ray.data,
+            "first": by_ray.indptr.astype(np.int32)}  # fmt: skip
+
+
+def by_rows_and_columns(arrays: Arrays, vertices: int) -> Arrays:
+    """The samples of `patch_task` for a mesh of so many vertices, as a network reads them: see
+    `src.nn.geodesic.Resampling`."""
+    rows = csr_array((arrays["weights"], arrays["indices"], arrays["first"]),
+                     shape=(len(arrays["first"]) - 1, vertices))  # fmt: skip
+    columns = rows.tocsc()
+    return {
+        "vertices": rows.indices, "weights": rows.data, "first": rows.indptr,
+        "samples": columns.indices, "sample_weights": columns.data, "sample_first": columns.indptr,
+    }  # fmt: skip
 
 
 def run_tasks(tasks: Iterable[Task], store: Store, workers: int | None, description: str) -> None:

@@ -9,7 +9,7 @@ from src.data.datamodule import CorrespondenceData
 from src.data.faust import Faust
 from src.data.faust_benchmark import FaustBenchmark
 from src.data.folder import Folder
-from src.data.preprocessing import Recipe
+from src.data.preprocessing import PatchRecipe, Recipe
 from src.data.shapes import ShapeSet
 from src.data.store import Store
 
@@ -25,9 +25,15 @@ def open_shapes(data: dict[str, Any]) -> ShapeSet:
 
 def open_data(config: dict[str, Any]) -> CorrespondenceData:
     """The data module that a whole config describes, in plain containers. Errors: as above."""
-    data, rings = config["data"], config["model"].get("rings")
+    data, model = config["data"], config["model"]
     shot = data["shot"]
-    recipe = Recipe(shot["radius"], shot["bins"], None if rings else config["seq_len"], rings)
+    if "patch" in model:
+        neighbourhood = {"patch": PatchRecipe(**model["patch"])}
+    elif model.get("rings"):
+        neighbourhood = {"rings": model["rings"]}
+    else:
+        neighbourhood = {"seq_len": config["seq_len"]}
+    recipe = Recipe(shot["radius"], shot["bins"], **neighbourhood)
     store = Store(data["cache_dir"])
     return CorrespondenceData(open_shapes(data), recipe, store, config["seed"],
                               data["shuffle_vertices"], data["workers"])  # fmt: skip

@@ -59,7 +59,7 @@ class SpiralLinear(nn.Module):
         )
         fan_in = length * (in_features + METRIC_FEATURES * metric)
         for layer in filter(None, (self.linear, self.metric)):
-            _glorot(layer.weight, fan_in, out_features)
+            glorot(layer.weight, fan_in, out_features)
         nn.init.zeros_(self.linear.bias)
 
     def forward(self, features: Tensor, spirals: Tensor, metric: Tensor | None = None) -> Tensor:
@@ -85,7 +85,7 @@ class SpiralLSTM(nn.Module):
         self.hidden = nn.Linear(out_features, gates, bias=False)
         fan_in = in_features + METRIC_FEATURES * metric + out_features
         for layer in filter(None, (self.input, self.metric, self.hidden)):
-            _glorot(layer.weight, fan_in, gates)
+            glorot(layer.weight, fan_in, gates)
         nn.init.zeros_(self.input.bias)
         nn.init.ones_(self.input.bias[out_features : 2 * out_features])  # remember, to begin with
 
@@ -115,7 +115,7 @@ class SpiralLSTM(nn.Module):
         return hidden
 
 
-def _glorot(weight: Tensor, fan_in: int, fan_out: int) -> None:
+def glorot(weight: Tensor, fan_in: int, fan_out: int) -> None:
     """Glorot and Bengio's (2010) uniform weights, for a block of a larger matrix too."""
     bound = (6.0 / (fan_in + fan_out)) ** 0.5
     nn.init.uniform_(weight, -bound, bound)

@@ -1,6 +1,8 @@
 """What a network is served: the right tensors, fresh spirals, and nothing of the numbering."""
 
 import logging
+from dataclasses import replace
+from itertools import pairwise
 
 import lightning as L
 import numpy as np
@@ -9,16 +11,29 @@ import torch
 
 from src.data import preprocessing
 from src.data.datamodule import CorrespondenceData, EpochSampler, draw_spirals
-from src.data.preprocessing import Recipe, descriptor_task, spiral_task
+from src.data.preprocessing import (
+    PatchRecipe,
+    Recipe,
+    by_rows_and_columns,
+    descriptor_task,
+    load_task,
+    patch_task,
+    spiral_task,
+)
 from src.data.shapes import DataError, Shape, ShapeSet
 from src.data.store import Store
+from src.geometry.geodesics import diameter
 from src.geometry.mesh import Mesh, MeshError
+from src.geometry.patches import geodesic_patches
 from src.geometry.shot import shot_descriptors
 from src.geometry.spirals import spiral_table
+from src.geometry.windows import gaussian_windows
 from tests.conftest import TOY_SPLIT, toy_shapes
 from tests.meshes import bumpy_sphere, lattice, punctured, union
 
 RECIPE = Recipe(shot_radius=0.3, shot_bins=4, seq_len=8)
+PATCHES = Recipe(shot_radius=0.3, shot_bins=4, patch=PatchRecipe(0.1, rings=3, rays=8))
+GAUSSIAN = replace(PATCHES, patch=replace(PATCHES.patch, weights="gaussian"))
 
 
 class Toy(ShapeSet):
@@ -161,6 +176,80 @@ def test_processes_divide_an_epoch_among_them(size, world):
     assert set(served) == set(range(size)) and len(served) - size < world
 
 
+# -------------------------------------------------------------------------------------- patches
+
+
+def dense_samples(patches, rings, rays):
+    """[V, rays, rings, V] from rows, and from columns."""
+    patches = {name: np.asarray(array) for name, array in patches.items()}
+    vertices = len(patches["sample_first"]) - 1
+    out = np.zeros((2, len(patches["first"]) - 1, vertices))
+    for i, (indices, weights, first) in enumerate(
+        [("vertices", "weights", "first"), ("samples", "sample_weights", "sample_first")]
+    ):
+        matrix = out[i].T if i else out[i]
+        for row, (begin, end) in enumerate(pairwise(patches[first])):
+            np.add.at(matrix[row], patches[indices][begin:end], patches[weights][begin:end])
+    return out.reshape(2, vertices, rays, rings, vertices)
+
+
+def test_patches_are_served_by_rows_and_by_columns(store):
+    data = serve(store, PATCHES)
+    item = data.datasets["val"][1]
+    assert not item.keys() & {"sequences", "first"}
+    dtypes = {name: str(t.dtype).removeprefix("torch.") for name, t in item["patches"].items()}
+    assert dtypes == {
+        "vertices": "int32", "weights": "float32", "first": "int32",
+        "samples": "int32", "sample_weights": "float32", "sample_first": "int32",
+    }  # fmt: skip
+    mesh = data.shapes.load("val/1.ply").mesh
+    table = geodesic_patches(mesh, 0.1 * diameter(mesh), 3, 8)
+    expected = np.zeros((162, 3, 8, 162))
+    for v, ring, ray, corner in np.ndindex(table.indices.shape):
+        at = table.indices[v, ring, ray, corner]
+        expected[v, ring, ray, at] += table.weights[v, ring, ray, corner]
+    by_rows, by_columns = dense_samples(item["patches"], 3, 8)
+    np.testing.assert_allclose(by_rows, expected.transpose(0, 2, 1, 3), atol=1e-6)
+    np.testing.assert_array_equal(by_columns, by_rows)
+
+
+def test_a_sample_that_left_the_surface_has_no_entries():
+    mesh = lattice(4, 5)
+    arrays = patch_task(mesh, PATCHES).compute(mesh, PATCHES.patch)
+    whole = geodesic_patches(mesh, 0.1 * diameter(mesh), 3, 8).whole.transpose(0, 2, 1)
+    assert 0 < whole.mean() < 1
+    np.testing.assert_array_equal(np.diff(arrays["first"]), 3 * whole.ravel())
+    patches = by_rows_and_columns(arrays, 20)
+    by_rows, by_columns = dense_samples(patches, 3, 8)
+    np.testing.assert_array_equal(by_columns, by_rows)
+    np.testing.assert_allclose(by_rows.sum(3), whole, atol=1e-6)
+
+
+def test_gaussian_windows_are_served_in_the_same_order(store):
+    data = serve(store, GAUSSIAN)
+    mesh = data.shapes.load("val/1.ply").mesh
+    table = gaussian_windows(mesh, 0.1 * diameter(mesh), 3, 8)
+    expected = np.zeros((162, 3, 8, 162))
+    for row, (begin, end) in enumerate(pairwise(table.first)):
+        expected.reshape(-1, 162)[row, table.indices[begin:end]] = table.weights[begin:end]
+    by_rows, by_columns = dense_samples(data.datasets["val"][1]["patches"], 3, 8)
+    np.testing.assert_array_equal(by_rows, expected.transpose(0, 2, 1, 3))
+    np.testing.assert_array_equal(by_columns, by_rows)
+
+
+def test_patches_are_served_as_they_are_in_every_iteration(store):
+    data = serve(store, PATCHES)
+    item = data.datasets["train"][0]
+    assert data.on_after_batch_transfer(item, 0) is item
+
+
+def test_patch_radii_follow_the_size_of_the_shape():
+    mesh = bumpy_sphere()
+    large = Mesh(1000 * mesh.vertices, mesh.faces)
+    small, large = (patch_task(m, PATCHES).compute(m, PATCHES.patch) for m in (mesh, large))
+    np.testing.assert_allclose(small["weights"], large["weights"], atol=1e-5)
+
+
 # -------------------------------------------------------------------------------- the numbering
 
 
@@ -207,6 +296,23 @@ def test_keys_depend_on_every_parameter(change):
     keys = [task(mesh, RECIPE).key == task(mesh, other).key
             for task in (descriptor_task, spiral_task)]  # fmt: skip
     assert sorted(keys) == [False, True]
+
+
+@pytest.mark.parametrize(
+    "change", [{"radius": 0.11}, {"rings": 4}, {"rays": 16}, {"weights": "gaussian"}]
+)
+def test_the_key_of_patches_depends_on_every_parameter(change):
+    mesh, other = bumpy_sphere(), replace(PATCHES, patch=replace(PATCHES.patch, **change))
+    assert patch_task(mesh, other).key != patch_task(mesh, PATCHES).key
+    moved = Mesh(mesh.vertices + 1e-9, mesh.faces)
+    assert patch_task(moved, PATCHES).key != patch_task(mesh, PATCHES).key
+
+
+def test_patches_come_back_from_the_cache_as_they_were(store):
+    task = patch_task(bumpy_sphere(), PATCHES)
+    once, again = load_task(task, store), load_task(task, store)
+    assert store.has("patches", task.key) and once.keys() == again.keys()
+    assert all(np.array_equal(once[k], again[k]) and once[k].dtype == again[k].dtype for k in once)
 
 
 def test_keys_depend_on_content_and_code_and_not_on_the_name(monkeypatch):

@@ -3,7 +3,8 @@
 import pytest
 import torch
 
-from src.nn.networks import FCSNet, LSTMNet
+from src.nn.networks import GCNN3, FCSNet, LSTMNet
+from tests.nn.test_geodesic import as_resampling, patches
 
 
 def parameters(net):
@@ -17,6 +18,10 @@ def test_lstm_net_has_the_parameters_of_table_1():
 @pytest.mark.parametrize("length, count", [(15, 2_530_356), (20, 2_763_356), (30, 3_229_356)])
 def test_fcs_net_has_the_parameters_of_table_1(length, count):
     assert parameters(FCSNet(544, 6890, length)) == count
+
+
+def test_gcnn3_has_the_parameters_of_table_1():
+    assert parameters(GCNN3(544, 6890)) == 2_672_634
 
 
 def test_metric_information_adds_two_channels_to_the_layers_that_take_it():
@@ -76,7 +81,7 @@ def test_metric_information_reaches_the_layers_it_should(name, place, layers, ba
     net = make(name, metric=True, metric_layers=place)
     net(features, spirals, extra).sum().backward()
     reached = [layer.metric is not None and bool(layer.metric.weight.grad.any())
-               for layer in net.spiral_layers]  # fmt: skip
+               for layer in net.layers]  # fmt: skip
     assert reached == [True] * layers + [False] * (3 - layers)
 
 
@@ -94,7 +99,7 @@ def test_dropout_is_off_in_evaluation_and_on_in_training(batch):
 
 
 def test_the_forget_gate_begins_open():
-    layer = LSTMNet(10, 21).spiral_layers[0]
+    layer = LSTMNet(10, 21).layers[0]
     i, f, g, o = layer.input.bias.chunk(4)
     assert (f == 1).all() and not any(gate.any() for gate in (i, g, o))
 
@@ -104,11 +109,33 @@ def test_a_network_is_the_stack_of_its_layers_with_relu_between(name, batch):
     features, spirals, _ = batch
     net = make(name, feature_scale=3.0).eval()
     x = torch.relu(net.lift(3.0 * features))
-    for layer in net.spiral_layers:
+    for layer in net.layers:
         x = torch.relu(layer(x, spirals))
     x = torch.relu(net.neck(x))
     torch.testing.assert_close(net.embed(features, spirals), x)
     torch.testing.assert_close(net(features, spirals), net.head(x))
+
+
+def test_gcnn3_is_the_stack_of_its_layers_with_relu_between():
+    torch.manual_seed(0)
+    net = GCNN3(10, 21, channels=[5, 6, 7], feature_scale=3.0).eval()
+    features, resampling = torch.randn(30, 10), as_resampling(*patches(30))
+    x = torch.relu(net.lift(3.0 * features))
+    for layer in net.layers:
+        x = torch.relu(layer(x, resampling))
+    x = torch.relu(net.neck(x))
+    torch.testing.assert_close(net.embed(features, resampling), x)
+    torch.testing.assert_close(net(features, resampling), net.head(x))
+    net.train()
+    assert not torch.equal(net(features, resampling), net(features, resampling))  # dropout
+
+
+def test_the_first_ray_of_a_patch_does_not_matter_to_gcnn3():
+    net = GCNN3(10, 21, channels=[5, 6, 7]).eval().double()
+    features, table = torch.randn(30, 10).double(), patches(30)
+    turned = [x.roll(5, 1) for x in table]
+    scores = [net(features, as_resampling(*t)) for t in (table, turned)]
+    torch.testing.assert_close(*scores, rtol=0, atol=1e-12)
 
 
 def test_dropout_follows_the_first_and_the_last_dense_layer(batch):
@@ -118,7 +145,7 @@ def test_dropout_follows_the_first_and_the_last_dense_layer(batch):
         for layer in (net.lift, net.neck):
             layer.bias.fill_(100.0)  # nothing but dropout makes zeros
         inputs = []
-        net.spiral_layers[0].register_forward_hook(lambda m, args, out: inputs.append(args[0]))
+        net.layers[0].register_forward_hook(lambda m, args, out: inputs.append(args[0]))
         out = net.embed(features, spirals)
     for x in (inputs[0], out):
         assert (x == 0).float().mean() == pytest.approx(0.9, abs=0.05)
