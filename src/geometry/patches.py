@@ -23,8 +23,8 @@ class PatchTable(NamedTuple):
     """The samples of every vertex's grid, each the weighted sum of three vertices.
 
     indices: int32 [V, rings, rays, 3]. weights: float32, likewise: barycentric, none negative, of
-    sum 1; or all 0, with indices 0, where there is no such sample, since the ray has left the
-    surface before.
+    sum 1; or all 0, with indices 0, where there is no such sample: the ray has left the surface
+    before, or the faces around the vertex have no angles to shoot it into.
     """
 
     indices: np.ndarray
@@ -41,9 +41,9 @@ def geodesic_patches(mesh: Mesh, radius: float, rings: int = 5, rays: int = 16) 
 
     Sample (i, j) lies at distance (i + 1) / rings * radius in direction (j + 1/2) 2 pi / rays,
     counter-clockwise as seen from outside. Directions are measured in the angles of the one-ring,
-    from an arbitrary neighbour, and rescaled to 2 pi; at a boundary vertex as they are, from the
-    last edge clockwise, and the directions outside its faces have no samples. Where several fans of
-    faces meet in a vertex, their angles follow one another.
+    from an arbitrary neighbour, and rescaled to 2 pi; at a boundary vertex as they are (unless they
+    exceed 2 pi), from the last edge clockwise, and the directions outside its faces have no
+    samples. Where several fans of faces meet in a vertex, their angles follow one another.
 
     radius: in the mesh's unit. Errors: ValueError for a radius that is not positive and finite, or
     rings or rays below 1.
@@ -138,7 +138,7 @@ def _trace(v, edge, right_angle, left_angle, vertices, neighbours, first, left,
     for _ in range(MOST_FACES):
         while (ring + 1) / rings * radius <= out_x:
             x = (ring + 1) / rings * radius
-            part = (x - in_x) / (out_x - in_x) if out_x > in_x else 1.0
+            part = (x - in_x) / (out_x - in_x)
             for i in range(3):
                 indices[ring, i] = corners[i]
                 weights[ring, i] = (1 - part) * entry[i] + part * leave[i]
@@ -164,14 +164,16 @@ def _trace(v, edge, right_angle, left_angle, vertices, neighbours, first, left,
             b, bx, by = d, dx, dy
             out_x, out_t = _crossing(bx, by, cx, cy)
             leave[0], leave[1], leave[2] = 0.0, out_t, 1 - out_t
-        out_x = max(out_x, in_x)
 
 
 @njit(cache=True)
 def _corner(vertices, v, b, c):
-    """The angle at v between b and c. A right angle where v and b coincide: the two faces at such
-    an edge then open half a turn to the rays, which go on into the faces around b."""
+    """The angle at v between b and c. A right angle where v coincides with one of them: the two
+    faces at such an edge then open half a turn to the rays, which go on into the faces around it.
+    """
     along, across = _coordinates(vertices, v, b, c)
+    if along == 0 and across == 0 and _coordinates(vertices, v, b, b)[0] > 0:
+        return np.pi / 2  # v and c coincide
     return np.arctan2(across, along)
 
 
