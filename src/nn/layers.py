@@ -10,6 +10,8 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+from src.nn.recurrence import recurrence
+
 METRIC_FEATURES = 2  # distance and angle
 
 
@@ -92,27 +94,10 @@ class SpiralLSTM(nn.Module):
     def forward(self, features: Tensor, spirals: Tensor, metric: Tensor | None = None) -> Tensor:
         # The input's share of the gates depends on the element alone, not on the sequence it
         # stands in: V products serve all V N elements.
-        projected = self.input(features)
-        ended = spirals < 0
-        any_ended = bool(ended.any())
-        rows = spirals.clamp(min=0)
-        hidden = cell = None
-        for step in range(spirals.shape[1]):
-            gates = projected.index_select(0, rows[:, step])
-            if self.metric is not None:
-                gates = gates + self.metric(metric[:, step])
-            if hidden is not None:
-                gates = gates + self.hidden(hidden)
-            i, f, g, o = gates.chunk(4, dim=1)
-            new_cell = torch.sigmoid(i) * torch.tanh(g)
-            if cell is not None:
-                new_cell = new_cell + torch.sigmoid(f) * cell
-            new_hidden = torch.sigmoid(o) * torch.tanh(new_cell)
-            if any_ended and hidden is not None:
-                keep = ended[:, step, None]
-                new_hidden, new_cell = hidden.where(keep, new_hidden), cell.where(keep, new_cell)
-            hidden, cell = new_hidden, new_cell
-        return hidden
+        if self.metric is None:
+            return recurrence(self.input(features), self.hidden.weight, spirals)
+        return recurrence(self.input(features), self.hidden.weight, spirals, metric,
+                          self.metric.weight)  # fmt: skip
 
 
 def glorot(weight: Tensor, fan_in: int, fan_out: int) -> None:

@@ -6,6 +6,7 @@ import torch
 from torch import nn
 from torch.nn import functional as F
 
+from src.nn import recurrence
 from src.nn.layers import SpiralLinear, SpiralLSTM, gather, metric_features
 
 
@@ -131,10 +132,50 @@ def test_spiral_lstm_is_the_last_real_output_of_an_lstm(metric, padded):
     torch.testing.assert_close(out, expected, rtol=0, atol=1e-12)
 
     upstream = torch.randn_like(out)
-    grad = torch.autograd.grad(out, [features, layer.hidden.weight, layer.input.bias], upstream)
-    same = torch.autograd.grad(expected, [features, lstm.weight_hh_l0, lstm.bias_ih_l0], upstream)
+    ours = [features, layer.hidden.weight, layer.input.bias, layer.input.weight]
+    theirs = [features, lstm.weight_hh_l0, lstm.bias_ih_l0, lstm.weight_ih_l0]
+    if metric:
+        ours.append(layer.metric.weight)
+    *grad, last = torch.autograd.grad(out, ours, upstream)
+    grad.append(torch.cat([grad.pop(), last], dim=1) if metric else last)
+    same = torch.autograd.grad(expected, theirs, upstream)
     for a, b in zip(grad, same, strict=True):
         torch.testing.assert_close(a, b, rtol=0, atol=1e-11)
+
+
+@pytest.mark.parametrize("rows", [1, 5, 13, 512])
+def test_an_lstm_over_few_sequences_at_a_time_is_the_same(rows, monkeypatch):
+    layer = SpiralLSTM(5, 7, metric=True).double()
+    features, spirals = torch.randn(13, 5, dtype=torch.float64), sequences(13, 6, padded=True)
+    extra = torch.randn(13, 6, 2, dtype=torch.float64)
+
+    def run():
+        layer.zero_grad()
+        out = layer(features, spirals, extra)
+        out.square().sum().backward()
+        return [out.detach(), *(p.grad.clone() for p in layer.parameters())]
+
+    whole = run()
+    monkeypatch.setattr(recurrence, "ROWS", rows)
+    for a, b in zip(run(), whole, strict=True):
+        torch.testing.assert_close(a, b, rtol=0, atol=1e-12)
+    with torch.no_grad():  # which keeps but two steps
+        torch.testing.assert_close(layer(features, spirals, extra), whole[0], rtol=0, atol=1e-12)
+
+
+def test_an_lstm_under_autocast_multiplies_in_bf16_and_remembers_in_float32():
+    layer = SpiralLSTM(8, 16)
+    features, spirals = torch.randn(40, 8, requires_grad=True), sequences(40, 20, padded=True)
+    exact = layer(features, spirals)
+    with torch.autocast("cpu", torch.bfloat16):
+        out = layer(features.bfloat16(), spirals)
+    assert out.dtype == torch.float32 and not torch.equal(out, exact)
+    torch.testing.assert_close(out, exact, rtol=0, atol=0.03)
+    grads = [torch.autograd.grad(x.square().sum(), [features, layer.hidden.weight])
+             for x in (out, exact)]  # fmt: skip
+    for a, b in zip(*grads, strict=True):
+        assert a.dtype == torch.float32
+        torch.testing.assert_close(a, b, rtol=0, atol=0.03 * float(b.abs().max()))
 
 
 def test_what_stands_in_the_padding_does_not_matter():
