@@ -84,9 +84,9 @@ class Correspondence(L.LightningModule):
 
     def _evaluate(self, split: str, batch: Batch) -> np.ndarray:
         x, head = self.embed(batch), self.net.head
-        loss = linear_cross_entropy(x, head.weight, head.bias, batch["labels"])
+        predicted, loss = predict(x, head.weight, head.bias, batch["labels"])
         self.log(f"{split}/loss", loss, batch_size=1, sync_dist=True)
-        predicted = predict(x, head.weight, head.bias).cpu().numpy()
+        predicted = predicted.cpu().numpy()
         labels = batch["labels"].cpu().numpy()
         errors = geodesic_errors(predicted, labels, self.distances)
         self.errors[split].update(errors, predicted == labels)

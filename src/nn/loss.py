@@ -67,12 +67,20 @@ class _LinearCrossEntropy(torch.autograd.Function):
 
 
 @torch.no_grad()
-def predict(x: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
-    """int64 [V]: the class with the largest score x weight^T + bias; arguments as above.
+def predict(x: Tensor, weight: Tensor, bias: Tensor, labels: Tensor) -> tuple[Tensor, Tensor]:
+    """int64 [V]: the class with the largest score x weight^T + bias; and the loss, as above.
 
     Never in bf16: among its 8 bits many scores would tie, and the first class win.
     """
+    classes = torch.empty_like(labels)
+    loss = torch.zeros((), dtype=weight.dtype, device=x.device)
     with torch.autocast(x.device.type, enabled=False):
-        x = x.to(weight.dtype)
-        return torch.cat([(x[i : i + ROWS] @ weight.T + bias).argmax(dim=1)
-                          for i in range(0, len(x), ROWS)])  # fmt: skip
+        for start in range(0, len(x), ROWS):
+            rows = slice(start, start + ROWS)
+            scores = torch.addmm(bias, x[rows].to(weight.dtype), weight.T)
+            best = torch.argmax(scores, dim=1, keepdim=True)
+            right = scores.gather(1, labels[rows, None])
+            largest = scores.gather(1, best)
+            loss += (scores.sub_(largest).exp_().sum(1, keepdim=True).log() + largest - right).sum()
+            classes[rows] = best[:, 0]
+    return classes, loss / len(x)

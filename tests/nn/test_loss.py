@@ -63,7 +63,10 @@ def test_without_gradients_the_value_is_the_same(layer):
 
 
 @pytest.mark.parametrize("rows", [4, 512])
-def test_predict_is_the_argmax(layer, rows, monkeypatch):
+def test_predict_is_the_argmax_and_the_loss(layer, rows, monkeypatch):
     monkeypatch.setattr(module, "ROWS", rows)
-    x, weight, bias, _ = layer
-    torch.testing.assert_close(predict(x, weight, bias), F.linear(x, weight, bias).argmax(1))
+    x, weight, bias, labels = layer
+    classes, loss = predict(*layer)
+    scores = F.linear(x, weight, bias)
+    torch.testing.assert_close(classes, scores.argmax(1))
+    torch.testing.assert_close(loss, F.cross_entropy(scores, labels), rtol=0, atol=1e-12)
