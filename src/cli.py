@@ -19,7 +19,7 @@ from hydra.errors import HydraException
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from src.config import ConfigError, checked
+from src.config import ConfigError
 from src.data.shapes import DataError
 from src.geometry.mesh import MeshError
 from src.runs import RunError, Stopped
@@ -56,8 +56,10 @@ def job_folder(overrides: list[str], number: int) -> str:
     return legal
 
 
-def entry_point(name: str) -> Callable[[Callable[[DictConfig], None]], Callable[[], None]]:
-    """Make `task(config)` a program with the config conf/<name>.yaml.
+def entry_point(
+    name: str, check: Callable[[DictConfig], DictConfig]
+) -> Callable[[Callable[[DictConfig], None]], Callable[[], None]]:
+    """Make `task(check(config))` a program with the config conf/<name>.yaml.
 
     A mistake of the user ends it with one message and exit code 1 (2 if the command line can't be
     read), Ctrl-C with 130 and SIGTERM with 143. Anything else is an error of ours and shows its
@@ -69,7 +71,7 @@ def entry_point(name: str) -> Callable[[Callable[[DictConfig], None]], Callable[
 
         def job(config: DictConfig) -> None:
             try:
-                task(checked(config))
+                task(check(config))
             except USER_ERRORS as error:
                 log.error("error: %s", one_line(error))
                 failed.append(one_line(error))

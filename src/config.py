@@ -144,7 +144,7 @@ def checked(config: DictConfig) -> DictConfig:
 
     Errors: ConfigError for an unknown key, a value of another type, or one out of range.
     """
-    typed = OmegaConf.structured(Train)
+    schema = OmegaConf.structured(Train)
     plain = OmegaConf.to_container(config, resolve=True)
     for group, schemas in (("model", MODELS), ("data", DATASETS)):
         _is_group(plain[group], group)
@@ -152,14 +152,14 @@ def checked(config: DictConfig) -> DictConfig:
         if name not in schemas:
             raise ConfigError(f"{group}.name must be one of {', '.join(schemas)}; got {name}")
         _known(plain[group], schemas[name], f"{group}.")
-        typed[group] = OmegaConf.structured(schemas[name])
+        schema[group] = OmegaConf.structured(schemas[name])
     _known(plain, Train, "")
     _known(plain["trainer"], Trainer, "trainer.")
     _known(plain["optim"], Optim, "optim.")
     _known(plain["data"]["shot"], Shot, "data.shot.")
-    if "patch" in typed.model:
+    if "patch" in schema.model:
         _known(plain["model"]["patch"], Patch, "model.patch.")
-    if "metric" in typed.model:
+    if "metric" in schema.model:
         if plain.get("metric") is not None:
             plain["model"]["metric"] = plain["metric"]  # the root key wins over an experiment's
         elif plain["model"].get("metric") is None:
@@ -169,14 +169,27 @@ def checked(config: DictConfig) -> DictConfig:
             "metric=true needs a model with spirals, whose elements carry it; "
             f"got model {plain['model']['name']}"
         )
+    _fill(schema, plain)
+    _check_ranges(schema)
+    return schema
+
+
+def typed(config: DictConfig, schema: type) -> DictConfig:
+    """A flat config with every value of its declared type. Errors: ConfigError as above."""
+    plain = OmegaConf.to_container(config, resolve=True)
+    _known(plain, schema, "")
+    filled = OmegaConf.structured(schema)
+    _fill(filled, plain)
+    return filled
+
+
+def _fill(schema: DictConfig, plain: dict[str, Any]) -> None:
     for key, value in flat(plain).items():
         try:
-            OmegaConf.update(typed, key, value)
+            OmegaConf.update(schema, key, value)
         except OmegaConfBaseException as error:
             reason = str(error).splitlines()[0]
             raise ConfigError(f"{key}={value}: {reason}") from error
-    _check_ranges(typed)
-    return typed
 
 
 def _check_ranges(typed: DictConfig) -> None:

@@ -18,7 +18,7 @@ from src.runs import BEST, LAST, RunError, Stopped, claim, continued, write_metr
 log = logging.getLogger("src.train")
 
 
-@entry_point("train")
+@entry_point("train", checked)
 def main(config: DictConfig) -> None:
     from hydra.core.hydra_config import HydraConfig
 

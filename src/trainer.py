@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import ctypes
 import logging
 import warnings
 from pathlib import Path
@@ -26,6 +28,8 @@ def build_trainer(config: DictConfig, folder: Path, *callbacks: Callback) -> L.T
     quiet()
     torch.set_num_threads(config.trainer.threads or torch.get_num_threads())
     torch.set_flush_denormal(True)  # tiny probabilities would slow the softmax down tenfold
+    if config.trainer.accelerator == "cpu":
+        keep_freed_memory()
     # `deterministic` below would also fill every new tensor with NaN; nothing here reads one unset
     torch.utils.deterministic.fill_uninitialized_memory = False
     asked = config.trainer
@@ -60,6 +64,18 @@ def build_trainer(config: DictConfig, folder: Path, *callbacks: Callback) -> L.T
             f"trainer: accelerator {asked.accelerator}, devices {asked.devices}, strategy "
             f"{asked.strategy}, precision {asked.precision} can't be had here ({reason})"
         ) from error
+
+
+def keep_freed_memory() -> None:
+    """Have the C library keep the memory of large tensors for the next ones of this process.
+
+    It would give each back to the system, and every page of the next be cleared and mapped again,
+    which takes a tenth of a step of LSTM-NET. Where the library is not GNU's, all stays as it is.
+    """
+    with contextlib.suppress(OSError, AttributeError):
+        mallopt = ctypes.CDLL("libc.so.6").mallopt
+        mallopt(-4, 0)  # M_MMAP_MAX: large blocks come from the heap as well
+        mallopt(-1, 2**31 - 1)  # M_TRIM_THRESHOLD: and the heap does not shrink
 
 
 def choose_precision(wanted: str, accelerator: str) -> str:

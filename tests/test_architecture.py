@@ -22,6 +22,8 @@ ALLOWED = {
     "callbacks": {"runs"},
     "correspondence": {"data", "nn", "metrics", "figures"},
     "trainer": {"callbacks", "config"},
+    "plain": {"nn"},
+    "measure": {"nn", "plain"},
     "summary": {"correspondence", "data", "figures", "metrics"},
     "cli": {"config", "runs", "data", "geometry"},
 }

@@ -23,7 +23,7 @@ def cli(monkeypatch, tmp_path, capfd):
     """Run the program in this process; returns (exit code, stdout, stderr)."""
     import logging
 
-    def call(*arguments: str):
+    def call(*arguments: str, program=main):
         GlobalHydra.instance().clear()
         handlers = {s: signal.getsignal(s) for s in (signal.SIGINT, signal.SIGTERM)}
         root = logging.getLogger()
@@ -31,7 +31,7 @@ def cli(monkeypatch, tmp_path, capfd):
         monkeypatch.setattr(sys, "argv", ["src.train", *arguments])
         code = 0
         try:
-            main()
+            program()
         except SystemExit as stop:
             code = stop.code or 0
         finally:

@@ -1,0 +1,263 @@
+"""What a step costs, by things measured in turn: `python -m src.benchmark`."""
+
+from __future__ import annotations
+
+import json
+import logging
+import os
+import platform
+import tempfile
+import time
+from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import torch
+from omegaconf import DictConfig, OmegaConf
+from tqdm import tqdm
+
+from src import measure
+from src.cli import entry_point
+from src.config import ConfigError, typed
+from src.data.datamodule import draw_spirals
+from src.data.preprocessing import (
+    PatchRecipe,
+    Recipe,
+    by_rows_and_columns,
+    descriptor_task,
+    patch_task,
+    run_tasks,
+    spiral_task,
+)
+from src.data.sources import open_shapes
+from src.data.store import Store
+from src.nn.geodesic import Resampling
+from src.nn.loss import linear_cross_entropy
+from src.nn.networks import GCNN3, FCSNet, LSTMNet
+from src.plain import PlainNetwork
+from src.runs import write_whole
+from src.trainer import choose_precision, keep_freed_memory
+
+log = logging.getLogger("src.benchmark")
+
+SHOT_RADIUS, PATCH_RADIUS = 0.16, 0.08  # as in conf/
+LARGE = (20_000, 100_000)  # vertices of a mesh and of a template that must fit into memory
+SIZES = [1500, 3000, 6000, 12_000, 25_000, 50_000, 100_000]
+LENGTHS = [10, 15, 20, 30, 40, 60]
+Row = dict[str, object]
+
+
+@dataclass
+class Benchmark:
+    vertices: int = 6890
+    seq_len: int = 20
+    repeats: int = 3
+    accelerator: str = "cpu"
+    precision: str = "auto"
+    threads: int | None = None
+    parts: list[str] = field(default_factory=list)
+
+
+def check(config: DictConfig) -> DictConfig:
+    checked = typed(config, Benchmark)
+    for key, values in {"vertices": (1500, 6890), "accelerator": ("cpu", "gpu"),
+                        "precision": ("32", "bf16", "auto")}.items():  # fmt: skip
+        if checked[key] not in values:
+            raise ConfigError(f"{key} must be one of {', '.join(map(str, values))}; "
+                              f"got {checked[key]}")  # fmt: skip
+    for key in ("seq_len", "repeats", "threads"):
+        if checked[key] is not None and checked[key] < 1:
+            raise ConfigError(f"{key} must be at least 1; got {checked[key]}")
+    for part in checked.parts:
+        if part not in PARTS:
+            raise ConfigError(f"parts must be of {', '.join(PARTS)}; got {part}")
+    if checked.accelerator == "gpu" and not torch.cuda.is_available():
+        raise ConfigError("accelerator=gpu: torch finds no GPU here")
+    return checked
+
+
+@entry_point("benchmark", check)
+def main(config: DictConfig) -> None:
+    from hydra.core.hydra_config import HydraConfig
+
+    folder = Path(HydraConfig.get().runtime.output_dir)
+    if config.threads:
+        torch.set_num_threads(config.threads)
+    torch.set_flush_denormal(True)
+    keep_freed_memory()  # ours and the plain ones alike: as in training
+    result: dict[str, object] = {"machine": machine(), "config": OmegaConf.to_container(config)}
+    log.info("%s", ", ".join(f"{key} {value}" for key, value in result["machine"].items()))
+    for part in config.parts:
+        result[part] = PARTS[part](config)
+        log.info("%s", "\n".join(lines(part, result[part])))
+        write_whole(folder / "benchmark.json", json.dumps(result, indent=2) + "\n")
+    log.info("%s", folder / "benchmark.json")
+
+
+def machine() -> dict[str, object]:
+    model = platform.processor()
+    cpuinfo = Path("/proc/cpuinfo")
+    if cpuinfo.exists():
+        found = [line for line in cpuinfo.read_text().splitlines() if "model name" in line]
+        model = found[0].split(":")[1].strip() if found else model
+    return {
+        "processor": model, "cores": os.cpu_count(), "threads": torch.get_num_threads(),
+        "bf16": choose_precision("auto", "cpu") == "bf16-mixed", "torch": torch.__version__,
+        "gpu": torch.cuda.get_device_name() if torch.cuda.is_available() else None,
+    }  # fmt: skip
+
+
+def lines(part: str, rows: list[Row]):
+    """A table, one column for each key."""
+    yield f"\n{part}"
+    names = list(rows[0])
+    cells = [[show(value) for value in row.values()] for row in rows]
+    widths = [max(len(row[i]) for row in [names, *cells]) for i in range(len(names))]
+    for first, *rest in [names, *cells]:
+        yield "  ".join(["", first.ljust(widths[0]),
+                         *(c.rjust(w) for c, w in zip(rest, widths[1:], strict=True))])  # fmt: skip
+
+
+def show(value: object) -> str:
+    if isinstance(value, list):
+        return " ".join(map(show, value))
+    return f"{value:,.{0 if value >= 100 else 3}f}" if isinstance(value, float) else str(value)
+
+
+# --------------------------------------------------------------------------------------- the parts
+
+
+def body(vertices: int):
+    shapes = open_shapes({"name": "bodies", "vertices": vertices})
+    return shapes.load(shapes.names["train"][0])
+
+
+def inputs(shape, seq_len: int, device: str):
+    """(features, labels, spiral table, drawn spirals, resampling), as in training."""
+    mesh = shape.mesh
+    recipe = Recipe(SHOT_RADIUS, 16, seq_len, patch=PatchRecipe(PATCH_RADIUS))
+    tasks = [make(mesh, recipe) for make in (descriptor_task, spiral_task, patch_task)]
+    shot, spirals, patches = (task.compute(*task.arguments) for task in tasks)
+    patches = by_rows_and_columns(patches, len(mesh.vertices))
+    to = partial(torch.as_tensor, device=device)
+    table = to(spirals["sequences"]), to(spirals["first"])
+    resampling = Resampling(**{name: to(array) for name, array in patches.items()})
+    return to(shot["features"]), to(shape.labels), table, draw_spirals(*table), resampling
+
+
+def networks(seq_len: int, classes: int) -> dict[str, torch.nn.Module]:
+    return {
+        "fcs": FCSNet(544, classes, seq_len, feature_scale=measure.SCALE),
+        "lstm": LSTMNet(544, classes, feature_scale=measure.SCALE),
+        "gcnn3": GCNN3(544, classes, feature_scale=measure.SCALE),
+    }
+
+
+def steps(config: DictConfig) -> list[Row]:
+    """Forward, backward and Adam: ours, plain (float32), the matrix products alone."""
+    device = "cuda" if config.accelerator == "gpu" else "cpu"
+    precision = choose_precision(config.precision, config.accelerator)
+    dtype = torch.bfloat16 if precision == "bf16-mixed" else torch.float32
+    features, labels, table, spirals, resampling = inputs(
+        body(config.vertices), config.seq_len, device
+    )
+    rows = []
+    for name, net in tqdm(networks(config.seq_len, config.vertices).items(), desc="Steps"):
+        net, around = net.to(device), resampling if name == "gcnn3" else spirals
+        plain = PlainNetwork(net).to(device)
+        found = measure.products(net, config.vertices, config.seq_len)
+        seconds = measure.medians({
+            "ours": measure.training_step(
+                net, partial(measure.fast_loss, net, features, around, labels), precision),
+            "plain": measure.training_step(plain, partial(plain.loss, features, around, labels)),
+            "products": measure.multiply(found, device, dtype),
+            "draw": partial(draw_spirals, *table),
+        }, config.repeats, device)  # fmt: skip
+        rows.append({
+            "network": name, "precision": precision,
+            **{f"{k} ms": 1e3 * v for k, v in seconds.items()},
+            "plain / ours": seconds["plain"] / seconds["ours"],
+            "ours / products": seconds["ours"] / seconds["products"],
+            "draw / ours": seconds["draw"] / seconds["ours"],
+            "Gflop": sum(product.operations for product in found) / 1e9,
+        })  # fmt: skip
+        del plain
+    return rows
+
+
+def memory(config: DictConfig) -> list[Row]:
+    """The peak of an FCS-NET step beyond parameters and inputs, each in a process of its own."""
+    sizes = [(config.vertices, config.vertices, True), (config.vertices, config.vertices, False),
+             (*LARGE, True)]  # fmt: skip
+    rows = []
+    for vertices, classes, ours in tqdm(sizes, desc="Memory"):
+        seconds, peak = measure.in_own_process(
+            measure.step_memory, vertices, classes, config.seq_len, ours
+        )
+        rows.append({"vertices": vertices, "template": classes, "ours": ours, "seconds": seconds,
+                     "peak MB": peak / 1e6 if peak else None})  # fmt: skip
+    for row in rows:
+        row["over ours"] = row["peak MB"] / rows[0]["peak MB"] if row["peak MB"] else None
+    return rows
+
+
+def preprocessing(config: DictConfig) -> list[Row]:
+    """Seconds on one core for one mesh, and with all cores for all 100 from an empty cache."""
+    shapes = open_shapes({"name": "bodies", "vertices": config.vertices})
+    recipe = Recipe(SHOT_RADIUS, 16, 30, patch=PatchRecipe(PATCH_RADIUS))
+    makers = {"shot": descriptor_task, "spirals (30)": spiral_task, "patches": patch_task}
+    mesh = shapes.load(shapes.names["train"][0]).mesh
+    tasks = {name: make(mesh, recipe) for name, make in makers.items()}
+    one = measure.medians(
+        {name: partial(task.compute, *task.arguments) for name, task in tasks.items()},
+        config.repeats,
+    )
+    with tempfile.TemporaryDirectory() as folder:
+        began = time.perf_counter()
+        names = [name for split in shapes.names.values() for name in split]
+        meshes = [shapes.load(name).mesh for name in names]
+        for make in makers.values():
+            run_tasks((make(m, recipe) for m in meshes), Store(folder), None, "Bodies")
+        everything = time.perf_counter() - began
+    rows: list[Row] = [{"what": name, "meshes": 1, "seconds": value} for name, value in one.items()]
+    return [*rows, {"what": "all three", "meshes": len(names), "seconds": everything}]
+
+
+def growth(config: DictConfig) -> list[Row]:
+    """Seconds over one size at a time, and the exponent over the upper half of the sizes."""
+    rows: list[Row] = []
+
+    def series(what: str, sizes: list[int], make) -> None:
+        seconds = []
+        for size in tqdm(sizes, desc=what):
+            seconds.append(measure.medians({"it": make(size)}, config.repeats)["it"])
+        upper = slice(len(sizes) // 2, None)
+        slope = np.polyfit(np.log(sizes[upper]), np.log(seconds[upper]), 1)[0]
+        rows.append({"what": what, "sizes": sizes, "exponent": float(slope),
+                     "seconds": [round(s, 4) for s in seconds]})  # fmt: skip
+
+    def without_head(vertices: int, seq_len: int):
+        features, spirals, _ = measure.random_inputs(vertices, 10, seq_len)
+        net = FCSNet(544, 10, seq_len, feature_scale=measure.SCALE)
+        return lambda: net.embed(features, spirals).sum().backward()
+
+    def head(vertices: int, classes: int):
+        x, weight = torch.randn(vertices, 256, requires_grad=True), torch.randn(classes, 256) / 16
+        weight.requires_grad_()
+        labels, bias = torch.randint(classes, (vertices,)), torch.zeros(classes)
+        return lambda: linear_cross_entropy(x, weight, bias, labels).backward()
+
+    series("FCS-NET without its head, over vertices", SIZES,
+           lambda vertices: without_head(vertices, config.seq_len))  # fmt: skip
+    series("FCS-NET without its head, over N", LENGTHS,
+           lambda length: without_head(config.vertices, length))  # fmt: skip
+    series("head, over the template", SIZES, lambda classes: head(1500, classes))
+    series("head, over vertices", SIZES, lambda vertices: head(vertices, 1500))
+    return rows
+
+
+PARTS = {"steps": steps, "memory": memory, "preprocessing": preprocessing, "growth": growth}
+
+if __name__ == "__main__":
+    main()
