@@ -235,6 +235,6 @@ def _third(vertices, a, b, c, distance, angle):
             part = np.arctan2((base - x) * cy - y * cx, (base - x) * cx + y * cy)  # from b to c
             # from b to a around v: not `wedge`, but within half a turn of it
             apart = wedge + _turn(angle[a] - angle[b] - wedge)
-            return r, angle[b] + (apart * part / wedge if wedge > 0 else 0.0)
+            return r, angle[b] + apart * part / wedge
     by_a, by_b = to_a + np.sqrt(cx**2 + cy**2), to_b + np.sqrt((cx - base) ** 2 + cy**2)
     return (by_a, angle[a]) if by_a < by_b else (by_b, angle[b])

@@ -10,9 +10,10 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from src.nn.recurrence import recurrence
+from src.nn.recurrence import add_product, recurrence
 
 METRIC_FEATURES = 2  # distance and angle
+ROWS = 1024  # sequences gathered at a time
 
 
 def metric_features(vertices: Tensor, spirals: Tensor, unit: Tensor | float) -> Tensor:
@@ -39,13 +40,6 @@ def metric_features(vertices: Tensor, spirals: Tensor, unit: Tensor | float) -> 
     return features.masked_fill_(ended[..., None], 0.0)
 
 
-def gather(features: Tensor, spirals: Tensor) -> Tensor:
-    """features[spirals], [V, N, C], with zeros where a spiral has ended (-1)."""
-    zero = features.new_zeros(1, features.shape[1])
-    rows = spirals.where(spirals >= 0, len(features))
-    return torch.cat([features, zero]).index_select(0, rows.reshape(-1)).view(*spirals.shape, -1)
-
-
 class SpiralLinear(nn.Module):
     """One linear map of the whole sequence of fixed length (the FCS layer of Lim et al. 2018).
 
@@ -67,8 +61,50 @@ class SpiralLinear(nn.Module):
     def forward(self, features: Tensor, spirals: Tensor, metric: Tensor | None = None) -> Tensor:
         if spirals.shape[1] != self.length:
             raise ValueError(f"spirals must have length {self.length}, got {spirals.shape[1]}")
-        out = self.linear(gather(features, spirals).flatten(1))
+        out = _SpiralProduct.apply(features, self.linear.weight, self.linear.bias, spirals)
         return out if self.metric is None else out + self.metric(metric.flatten(1))
+
+
+class _SpiralProduct(torch.autograd.Function):
+    """features[spirals] weight^T + bias, with zeros where a spiral has ended.
+
+    The sequences, N times as large as the features, only ever exist for ROWS vertices: backwards
+    they are gathered once more, which costs less than to keep them.
+    """
+
+    @staticmethod
+    def forward(ctx, features, weight, bias, spirals):
+        device = features.device.type
+        product = weight.dtype
+        if torch.is_autocast_enabled(device):
+            product = torch.get_autocast_dtype(device)
+        last = len(features)
+        features = torch.cat([features, features.new_zeros(1, features.shape[1])]).to(product)
+        weight, bias = weight.to(product), bias.to(product)
+        elements = spirals.where(spirals >= 0, last)
+        out = features.new_empty(len(spirals), len(weight))
+        for start in range(0, len(spirals), ROWS):
+            rows = slice(start, start + ROWS)
+            sequences = features.index_select(0, elements[rows].reshape(-1))
+            torch.addmm(bias, sequences.view(-1, weight.shape[1]), weight.T, out=out[rows])
+        ctx.save_for_backward(features, weight, elements)
+        return out
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx, grad):
+        features, weight, elements = ctx.saved_tensors
+        total = torch.promote_types(weight.dtype, torch.float32)  # of sums over vertices
+        d_features = torch.zeros_like(features, dtype=total)
+        d_weight = torch.zeros_like(weight, dtype=total)
+        for start in range(0, len(elements), ROWS):
+            rows = slice(start, start + ROWS)
+            flat = elements[rows].reshape(-1)
+            sequences = features.index_select(0, flat).view(-1, weight.shape[1])
+            add_product(d_weight, grad[rows].T, sequences)
+            torch.mm(grad[rows], weight, out=sequences)
+            d_features.index_add_(0, flat, sequences.view(len(flat), -1).to(total))
+        return d_features[:-1], d_weight, grad.sum(0, dtype=total), None
 
 
 class SpiralLSTM(nn.Module):

@@ -56,7 +56,7 @@ class _Recurrence(torch.autograd.Function):
             if metric is not None:
                 gates[now].addmm_(metric[:, step].to(weight.dtype), metric_weight.T)
             if step > 0:
-                _add_product(gates[now], hidden[before].to(product), recurrent)
+                add_product(gates[now], hidden[before].to(product), recurrent)
             i, f, g, o = gates[now].split(width, dim=1)
             i.sigmoid_(), f.sigmoid_(), g.tanh_(), o.sigmoid_()
             torch.mul(i, g, out=cells[now])
@@ -113,7 +113,7 @@ class _Recurrence(torch.autograd.Function):
         return d_projected.to(product), d_weight, d_metric, None, None
 
 
-def _add_product(total: Tensor, a: Tensor, b: Tensor) -> None:
+def add_product(total: Tensor, a: Tensor, b: Tensor) -> None:
     """total += a b, in one pass where the dtypes allow it."""
     if a.dtype == total.dtype:
         total.addmm_(a, b)

@@ -6,8 +6,8 @@ import torch
 from torch import nn
 from torch.nn import functional as F
 
-from src.nn import recurrence
-from src.nn.layers import SpiralLinear, SpiralLSTM, gather, metric_features
+from src.nn import layers, recurrence
+from src.nn.layers import SpiralLinear, SpiralLSTM, metric_features
 
 
 def sequences(vertices, length, padded, seed=0):
@@ -69,12 +69,9 @@ def test_coincident_vertices_give_finite_features():
     assert torch.isfinite(features).all()
 
 
-def test_gather_puts_zeros_where_a_spiral_has_ended():
-    features = torch.randn(6, 3)
-    spirals = torch.tensor([[0, 5, 2], [1, -1, -1]])
-    out = gather(features, spirals)
-    torch.testing.assert_close(out[0], features[[0, 5, 2]])
-    assert (out[1, 1:] == 0).all()
+def gather(features, spirals):
+    """features[spirals], with zeros where a spiral has ended."""
+    return features[spirals] * (spirals >= 0)[..., None]
 
 
 @pytest.mark.parametrize("metric", [False, True])
@@ -93,6 +90,36 @@ def test_spiral_linear_is_one_linear_map_of_the_sequence(metric, padded):
             if metric:
                 expected += layer.metric.weight[:, 2 * i : 2 * i + 2] @ extra[v, i]
         torch.testing.assert_close(out[v], expected)
+
+
+@pytest.mark.parametrize("rows", [1, 4, 1024])
+@pytest.mark.parametrize("padded", [False, True])
+def test_gradients_of_spiral_linear_are_those_of_the_gathered_sequence(padded, rows, monkeypatch):
+    monkeypatch.setattr(layers, "ROWS", rows)
+    layer = SpiralLinear(5, 4, 6).double()
+    features = torch.randn(11, 5, dtype=torch.float64, requires_grad=True)
+    spirals = sequences(11, 6, padded)
+    out, expected = layer(features, spirals), layer.linear(gather(features, spirals).flatten(1))
+    torch.testing.assert_close(out, expected, rtol=0, atol=1e-12)
+    upstream, of = torch.randn_like(out), [features, layer.linear.weight, layer.linear.bias]
+    ours, theirs = (torch.autograd.grad(x, of, upstream) for x in (out, expected))
+    for a, b in zip(ours, theirs, strict=True):
+        torch.testing.assert_close(a, b, rtol=0, atol=1e-12)
+
+
+def test_spiral_linear_under_autocast_multiplies_in_bf16_and_adds_up_in_float32():
+    layer = SpiralLinear(8, 16, 6)
+    features, spirals = torch.randn(3000, 8, requires_grad=True), sequences(3000, 6, padded=True)
+    of = [features, layer.linear.weight, layer.linear.bias]
+    exact = layer(features, spirals)
+    with torch.autocast("cpu", torch.bfloat16):
+        out = layer(features, spirals)
+    assert out.dtype == torch.bfloat16
+    torch.testing.assert_close(out.float(), exact, rtol=0, atol=0.05)
+    ours, theirs = (torch.autograd.grad(x.float().sum(), of) for x in (out, exact))
+    for a, b in zip(ours, theirs, strict=True):
+        assert a.dtype == torch.float32
+        torch.testing.assert_close(a, b, rtol=0, atol=0.01 * float(b.abs().max()))
 
 
 def test_spiral_linear_refuses_another_length():
