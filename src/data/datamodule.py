@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Iterator
 from functools import cached_property
+from itertools import chain
 
 import lightning as L
 import numpy as np
@@ -160,9 +161,8 @@ class CorrespondenceData(L.LightningDataModule):
             shapes.append(shape)
             described = descriptor_task(shape.mesh, self.recipe)
             tasks.append((described, neighbourhood_task(shape.mesh, self.recipe)))
-        kind = "Patches" if self.recipe.patch else "Spirals"
-        run_tasks((t for t, _ in tasks), self.store, self.workers, "Descriptors")
-        run_tasks((t for _, t in tasks), self.store, self.workers, kind)
+        what = "Descriptors and " + ("patches" if self.recipe.patch else "spirals")
+        run_tasks(chain(*tasks), self.store, self.workers, what)
         loaded: dict[str, Batch] = {}  # meshes share the spirals they have alike
         items: dict[str, list[Batch]] = {split: [] for split in wanted}
         progress = tqdm(zip(names, shapes, tasks, strict=True), total=len(names),

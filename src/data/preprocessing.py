@@ -140,7 +140,7 @@ def run_tasks(tasks: Iterable[Task], store: Store, workers: int | None, descript
     missing = {task.key: task for task in tasks if not store.has(task.kind, task.key)}
     queue = list(missing.values())
     workers = min(workers or cpu_count(), len(queue))
-    progress = tqdm(total=len(queue), desc=description, unit="mesh", delay=1.0)
+    progress = tqdm(total=len(queue), desc=description, delay=1.0)
     with progress:
         started = None
         for done, task in enumerate(queue):

@@ -57,7 +57,9 @@ def geodesic_patches(mesh: Mesh, radius: float, rings: int = 5, rays: int = 16) 
     shape = (len(mesh.vertices), rings, rays, 3)
     indices, weights = np.zeros(shape, np.int32), np.zeros(shape, np.float32)
     for_numba = mesh.vertices, neighbours, first, left
-    _trace_all(*for_numba, _directions(*for_numba), float(radius), indices, weights)
+    onward = _onward(neighbours, first, left)
+    directions = _directions(*for_numba)
+    _trace_all(*for_numba, onward, directions, float(radius), indices, weights)
     return PatchTable(indices, weights)
 
 
@@ -82,6 +84,20 @@ def _left(faces, neighbours, first):
 
 
 @njit(cache=True)
+def _onward(neighbours, first, left):
+    """int32 [E, 2]: for the directed edge from c to b, with d on its left, the directed edges from
+    d to b and from c to d: those by which a ray leaves that face, seen from the next one."""
+    out = np.full((len(neighbours), 2), -1, np.int32)
+    for c in range(len(first) - 1):
+        for k in range(first[c], first[c + 1]):
+            d = left[k]
+            if d >= 0:
+                out[k, 0] = _slot(neighbours, first, d, neighbours[k])
+                out[k, 1] = _slot(neighbours, first, c, d)
+    return out
+
+
+@njit(cache=True)
 def _directions(vertices, neighbours, first, left):
     """float64 [E, 2]: where the face on the left of each directed edge begins and ends around the
     edge's source, counter-clockwise, as `geodesic_patches` measures directions."""
@@ -101,7 +117,7 @@ def _directions(vertices, neighbours, first, left):
 
 
 @njit(cache=True)
-def _trace_all(vertices, neighbours, first, left, directions, radius, indices, weights):
+def _trace_all(vertices, neighbours, first, left, onward, directions, radius, indices, weights):
     rays = indices.shape[2]
     for v in range(len(first) - 1):
         for ray in range(rays):
@@ -111,13 +127,13 @@ def _trace_all(vertices, neighbours, first, left, directions, radius, indices, w
                 if begin <= direction < end:
                     corner = _corner(vertices, v, neighbours[k], left[k])
                     right = corner * (direction - begin) / (end - begin)
-                    _trace(v, k, right, corner - right, vertices, neighbours, first, left,
+                    _trace(v, k, right, corner - right, vertices, neighbours, left, onward,
                            radius, indices[v, :, ray], weights[v, :, ray])  # fmt: skip
                     break
 
 
 @njit(cache=True)
-def _trace(v, edge, right_angle, left_angle, vertices, neighbours, first, left,
+def _trace(v, edge, right_angle, left_angle, vertices, neighbours, left, onward,
            radius, indices, weights):  # fmt: skip
     """Follow one ray and write its samples, [rings, 3].
 
@@ -134,6 +150,7 @@ def _trace(v, edge, right_angle, left_angle, vertices, neighbours, first, left,
     corners = np.array([v, b, c])  # of the present face
     entry = np.array([1.0, 0.0, 0.0])  # where the ray comes in, by its corners
     leave = np.array([0.0, 1 - out_t, out_t])  # where it goes out
+    edge = onward[edge, 0]  # from now on that from c to b
     in_x, ring = 0.0, 0
     for _ in range(MOST_FACES):
         while (ring + 1) / rings * radius <= out_x:
@@ -145,7 +162,7 @@ def _trace(v, edge, right_angle, left_angle, vertices, neighbours, first, left,
             ring += 1
             if ring == rings:
                 return
-        d = left[_slot(neighbours, first, c, b)]
+        d = left[edge]
         if d < 0:
             return  # left the surface
         ex, ey = cx - bx, cy - by
@@ -156,6 +173,7 @@ def _trace(v, edge, right_angle, left_angle, vertices, neighbours, first, left,
         corners[0], corners[1], corners[2] = b, c, d
         entry[0], entry[1], entry[2] = 1 - out_t, out_t, 0.0
         in_x = out_x
+        edge = onward[edge, 0 if dy > 0 else 1]
         if dy > 0:
             c, cx, cy = d, dx, dy
             out_x, out_t = _crossing(bx, by, cx, cy)

@@ -1,5 +1,7 @@
 """Polar coordinates are exact where they can be; the windows are the published formulae on them."""
 
+from time import process_time
+
 import numpy as np
 import pytest
 import trimesh
@@ -288,6 +290,17 @@ def test_on_damaged_meshes_every_row_is_whole(mesh, how):
     damaged = collapsed(mesh, how)
     for radius in (0.3, 2.0):
         check_whole(gaussian_windows(damaged, radius, 2, 5), damaged, 2, 5)
+
+
+def test_where_needles_correct_one_another_without_end_the_front_ends():
+    """Half a second; forty times that, if every correction were followed up."""
+    mesh = punctured(bumpy_sphere(3, 3), 0.4)
+    mesh = Mesh(mesh.vertices * [1e5, 1, 1], mesh.faces)
+    polar(mesh, 0, 1.0)  # compile
+    start = process_time()
+    for v in range(0, len(mesh.vertices), 40):
+        polar(mesh, v, 1e7)
+    assert process_time() - start < 5
 
 
 def test_a_patch_without_area_takes_all_vertices_alike():
