@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import platform
 import signal
 import subprocess
 import sys
@@ -430,3 +431,18 @@ def test_without_opengl_there_is_no_picture_and_one_line_says_so(
     run(tmp_path, [*toy_overrides, "optim.epochs=1", "picture=true"])
     assert "no correspondence.png: VTK could not draw; it needs an OpenGL library" in caplog.text
     assert (tmp_path / METRICS).is_file()
+
+
+def test_freed_memory_stays_with_the_process():
+    """Where the C library is GNU's; elsewhere nothing is promised."""
+    if platform.libc_ver()[0] != "glibc":
+        pytest.skip("another C library")
+    script = (
+        "import resource, torch; from src.trainer import keep_freed_memory; keep_freed_memory()\n"
+        "for i in range(20):\n"
+        "    torch.ones(2**24)\n"
+        "    if i == 1: first = resource.getrusage(resource.RUSAGE_SELF).ru_minflt\n"
+        "print(resource.getrusage(resource.RUSAGE_SELF).ru_minflt - first)"
+    )
+    done = subprocess.run([sys.executable, "-c", script], cwd=ROOT, capture_output=True, text=True)
+    assert int(done.stdout) < 2**14  # one such tensor has as many pages
