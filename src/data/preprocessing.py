@@ -21,7 +21,7 @@ WEIGHTS = ("interpolation", "gaussian")
 
 @dataclass(frozen=True)
 class PatchRecipe:
-    """The polar grid around every vertex.
+    """The polar grid around every vertex, its first ray in a direction drawn at random.
 
     radius: over the mesh's geodesic diameter. weights: how a sample is blended from vertices; by
     "interpolation" in the triangle it lies in, or by the "gaussian" windows of the original.
@@ -104,7 +104,8 @@ def _spirals(mesh_: Mesh, seq_len: int | None, rings: int | None) -> Arrays:
 
 
 def _patches(mesh_: Mesh, patch: PatchRecipe) -> Arrays:
-    grid = (patch.radius * geodesics.diameter(mesh_), patch.rings, patch.rays)
+    radius = patch.radius * geodesics.diameter(mesh_)
+    grid = (radius, patch.rings, patch.rays, first_directions(mesh_))
     if patch.weights == "gaussian":
         indices, weights, first = windows.gaussian_windows(mesh_, *grid)
     else:
@@ -117,6 +118,16 @@ def _patches(mesh_: Mesh, patch: PatchRecipe) -> Arrays:
     by_ray = samples[rows.transpose(0, 2, 1).ravel()]
     return {"indices": by_ray.indices.astype(np.int32), "weights": by_ray.data,
             "first": by_ray.indptr.astype(np.int32)}  # fmt: skip
+
+
+def first_directions(mesh_: Mesh) -> np.ndarray:
+    """float64 [V]: where the grid of each vertex begins, at random, and always alike for one mesh.
+
+    Else the grids of registered meshes would all begin at the same edges, and a network would know
+    its vertices by them.
+    """
+    rng = np.random.default_rng(int(digest(mesh_.vertices, mesh_.faces)[:15], 16))
+    return rng.uniform(0, 2 * np.pi, len(mesh_.vertices))
 
 
 def by_rows_and_columns(arrays: Arrays, vertices: int) -> Arrays:

@@ -36,7 +36,9 @@ class PatchTable(NamedTuple):
         return self.weights.any(axis=3)
 
 
-def geodesic_patches(mesh: Mesh, radius: float, rings: int = 5, rays: int = 16) -> PatchTable:
+def geodesic_patches(
+    mesh: Mesh, radius: float, rings: int = 5, rays: int = 16, turn: np.ndarray | None = None
+) -> PatchTable:
     """The polar grid around every vertex, `rings` x `rays` samples up to distance `radius`.
 
     Sample (i, j) lies at distance (i + 1) / rings * radius in direction (j + 1/2) 2 pi / rays,
@@ -45,8 +47,9 @@ def geodesic_patches(mesh: Mesh, radius: float, rings: int = 5, rays: int = 16) 
     exceed 2 pi), from the last edge clockwise, and the directions outside its faces have no
     samples. Where several fans of faces meet in a vertex, their angles follow one another.
 
-    radius: in the mesh's unit. Errors: ValueError for a radius that is not positive and finite, or
-    rings or rays below 1.
+    radius: in the mesh's unit. turn: float [V], radians by which the grid of each vertex is turned
+    counter-clockwise; None for none. Errors: ValueError for a radius that is not positive and
+    finite, or rings or rays below 1.
     """
     if not (np.isfinite(radius) and radius > 0):
         raise ValueError(f"radius must be positive and finite, got {radius}")
@@ -59,7 +62,8 @@ def geodesic_patches(mesh: Mesh, radius: float, rings: int = 5, rays: int = 16) 
     for_numba = mesh.vertices, neighbours, first, left
     onward = _onward(neighbours, first, left)
     directions = _directions(*for_numba)
-    _trace_all(*for_numba, onward, directions, float(radius), indices, weights)
+    turn = np.zeros(len(mesh.vertices)) if turn is None else np.asarray(turn, dtype=np.float64)
+    _trace_all(*for_numba, onward, directions, turn, float(radius), indices, weights)
     return PatchTable(indices, weights)
 
 
@@ -117,11 +121,12 @@ def _directions(vertices, neighbours, first, left):
 
 
 @njit(cache=True)
-def _trace_all(vertices, neighbours, first, left, onward, directions, radius, indices, weights):
+def _trace_all(vertices, neighbours, first, left, onward, directions, turn, radius,
+               indices, weights):  # fmt: skip
     rays = indices.shape[2]
     for v in range(len(first) - 1):
         for ray in range(rays):
-            direction = (ray + 0.5) * 2 * np.pi / rays
+            direction = ((ray + 0.5) * 2 * np.pi / rays + turn[v]) % (2 * np.pi)
             for k in range(first[v], first[v + 1]):
                 begin, end = directions[k]
                 if begin <= direction < end:

@@ -7,7 +7,8 @@ the rays; but a patch ends at the radius, and distances to the rays follow from 
 
 These are discrete geodesic polar coordinates (Melvaer, Reimers 2012): a front grows from the vertex
 as in Dijkstra's algorithm, but across faces. Two corners of a face are laid into the plane together
-with the source that their distances belong to, and the third corner is measured from there.
+with the source that their distances belong to, and the third corner is measured from there. Where
+the surface is flat that is exact.
 """
 
 from __future__ import annotations
@@ -24,7 +25,7 @@ from src.geometry.patches import _coordinates, _directions, _left
 
 LEAST_SHARE = 0.01  # of a row's largest weight; what is below is dropped
 CLOSER = 1 - 1e-10  # a distance gives way only to one that is less by more than rounding
-MOST_TURNS = 100  # that a vertex is taken up; only faces folded onto a line reach it
+MOST_TURNS = 100  # that a vertex is taken up; needles far longer than a thousand widths reach it
 
 
 class WindowTable(NamedTuple):
@@ -40,7 +41,9 @@ class WindowTable(NamedTuple):
     first: np.ndarray
 
 
-def gaussian_windows(mesh: Mesh, radius: float, rings: int = 5, rays: int = 16) -> WindowTable:
+def gaussian_windows(
+    mesh: Mesh, radius: float, rings: int = 5, rays: int = 16, turn: np.ndarray | None = None
+) -> WindowTable:
     """The windows of every vertex over the vertices up to geodesic distance `radius`, itself too.
 
     In cell (i, j), from 0, vertex u at distance r and angle t has the weight
@@ -59,8 +62,9 @@ def gaussian_windows(mesh: Mesh, radius: float, rings: int = 5, rays: int = 16) 
     Renumbering the mesh renumbers rows and indices, but for the order within a row and the
     arbitrary first direction; where two shortest ways are equally long, either may be taken.
 
-    radius: in the mesh's unit. Errors: ValueError for a radius that is not positive and finite, or
-    rings or rays below 1.
+    radius: in the mesh's unit. turn: float [V], radians by which the grid of each vertex is turned
+    counter-clockwise; None for none. Errors: ValueError for a radius that is not positive and
+    finite, or rings or rays below 1.
     """
     if not (np.isfinite(radius) and radius > 0):
         raise ValueError(f"radius must be positive and finite, got {radius}")
@@ -70,7 +74,10 @@ def gaussian_windows(mesh: Mesh, radius: float, rings: int = 5, rays: int = 16) 
     for_numba = mesh.vertices, neighbours, first, _left(mesh.faces, neighbours, first)
     thirds = np.repeat(np.linalg.norm(mesh.face_normals, axis=1) / 6, 3)
     areas = np.bincount(mesh.faces.ravel(), thirds, len(mesh.vertices))
-    for_numba += _directions(*for_numba), areas
+    directions = _directions(*for_numba)
+    if turn is not None:
+        directions -= np.repeat(turn, np.diff(first))[:, None]
+    for_numba += directions, areas
     return WindowTable(*_all_windows(*for_numba, float(radius), rings, rays))
 
 

@@ -631,3 +631,28 @@ def test_a_radius_that_is_none_is_refused(radius):
 def test_a_grid_without_samples_is_refused(rings, rays):
     with pytest.raises(ValueError, match=f"at least 1, got {rings} and {rays}"):
         geodesic_patches(lattice(3, 3), 1.0, rings, rays)
+
+
+@pytest.mark.parametrize("mesh", [bumpy_sphere(), lattice(7, 8)], ids=["sphere", "lattice"])
+def test_turned_by_whole_rays_the_samples_move_on_by_as_many(mesh):
+    shifts = np.arange(len(mesh.vertices)) % 16
+    little = 1e-3  # so that no ray meets an edge of the lattice's boundary
+    plain, turned = (geodesic_patches(mesh, 0.5, turn=s * 2 * np.pi / 16 + little)
+                     for s in (0 * shifts, shifts))  # fmt: skip
+    for v, shift in enumerate(shifts):
+        np.testing.assert_array_equal(turned.indices[v], np.roll(plain.indices[v], -shift, axis=1))
+        np.testing.assert_allclose(
+            turned.weights[v], np.roll(plain.weights[v], -shift, axis=1), atol=1e-5
+        )
+
+
+def test_on_a_plane_a_turn_is_an_angle():
+    mesh = lattice(9, 9)
+    plain, turned = (geodesic_patches(mesh, 2.0, turn=np.full(81, t)) for t in (0.0, 0.3))
+    a, b = (np.einsum("rsk,rskx->rsx", t.weights[40], mesh.vertices[t.indices[40]])
+            for t in (plain, turned))  # fmt: skip
+    cosine, sine = np.cos(0.3), np.sin(0.3)
+    a, b = a - mesh.vertices[40], b - mesh.vertices[40]
+    rotated = np.stack([cosine * a[..., 0] - sine * a[..., 1],
+                        sine * a[..., 0] + cosine * a[..., 1], a[..., 2]], axis=-1)  # fmt: skip
+    np.testing.assert_allclose(b, rotated, atol=1e-5)
