@@ -16,8 +16,6 @@ from src.data.store import Arrays, Store, code_version, digest
 from src.geometry import connectivity, geodesics, mesh, patches, shot, spirals, windows
 from src.geometry.mesh import Mesh, MeshError
 
-WEIGHTS = ("interpolation", "gaussian")
-
 
 @dataclass(frozen=True)
 class PatchRecipe:

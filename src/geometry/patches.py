@@ -51,10 +51,7 @@ def geodesic_patches(
     counter-clockwise; None for none. Errors: ValueError for a radius that is not positive and
     finite, or rings or rays below 1.
     """
-    if not (np.isfinite(radius) and radius > 0):
-        raise ValueError(f"radius must be positive and finite, got {radius}")
-    if rings < 1 or rays < 1:
-        raise ValueError(f"rings and rays must be at least 1, got {rings} and {rays}")
+    check_grid(radius, rings, rays)
     neighbours, first = one_rings(mesh)
     left = _left(mesh.faces, neighbours, first)
     shape = (len(mesh.vertices), rings, rays, 3)
@@ -65,6 +62,14 @@ def geodesic_patches(
     turn = np.zeros(len(mesh.vertices)) if turn is None else np.asarray(turn, dtype=np.float64)
     _trace_all(*for_numba, onward, directions, turn, float(radius), indices, weights)
     return PatchTable(indices, weights)
+
+
+def check_grid(radius: float, rings: int, rays: int) -> None:
+    """Errors: ValueError for a grid that can't be."""
+    if not (np.isfinite(radius) and radius > 0):
+        raise ValueError(f"radius must be positive and finite, got {radius}")
+    if rings < 1 or rays < 1:
+        raise ValueError(f"rings and rays must be at least 1, got {rings} and {rays}")
 
 
 @njit(cache=True)

@@ -21,7 +21,7 @@ from numba import njit
 
 from src.geometry.connectivity import one_rings
 from src.geometry.mesh import Mesh
-from src.geometry.patches import _coordinates, _directions, _left
+from src.geometry.patches import _coordinates, _directions, _left, check_grid
 
 LEAST_SHARE = 0.01  # of a row's largest weight; what is below is dropped
 CLOSER = 1 - 1e-10  # a distance gives way only to one that is less by more than rounding
@@ -66,10 +66,7 @@ def gaussian_windows(
     counter-clockwise; None for none. Errors: ValueError for a radius that is not positive and
     finite, or rings or rays below 1.
     """
-    if not (np.isfinite(radius) and radius > 0):
-        raise ValueError(f"radius must be positive and finite, got {radius}")
-    if rings < 1 or rays < 1:
-        raise ValueError(f"rings and rays must be at least 1, got {rings} and {rays}")
+    check_grid(radius, rings, rays)
     neighbours, first = one_rings(mesh)
     for_numba = mesh.vertices, neighbours, first, _left(mesh.faces, neighbours, first)
     thirds = np.repeat(np.linalg.norm(mesh.face_normals, axis=1) / 6, 3)

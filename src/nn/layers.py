@@ -10,7 +10,8 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from src.nn.recurrence import add_product, recurrence
+from src.nn.precision import add_product, product_dtype
+from src.nn.recurrence import recurrence
 
 METRIC_FEATURES = 2  # distance and angle
 ROWS = 2048  # sequences gathered at a time: fewer took a twentieth more time, more only more memory
@@ -74,10 +75,7 @@ class _SpiralProduct(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx, features, weight, bias, spirals):
-        device = features.device.type
-        product = weight.dtype
-        if torch.is_autocast_enabled(device):
-            product = torch.get_autocast_dtype(device)
+        product = product_dtype(weight)
         last = len(features)
         features = torch.cat([features, features.new_zeros(1, features.shape[1])]).to(product)
         weight, bias = weight.to(product), bias.to(product)

@@ -5,6 +5,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from src.nn.precision import add_product, product_dtype
+
 ROWS = 512  # scores of 512 vertices at a time stay in a processor's cache
 
 
@@ -23,10 +25,7 @@ class _LinearCrossEntropy(torch.autograd.Function):
     @staticmethod
     def forward(ctx, x, weight, bias, labels):
         device = x.device.type
-        if torch.is_autocast_enabled(device):
-            product = torch.get_autocast_dtype(device)
-        else:
-            product = weight.dtype
+        product = product_dtype(weight)
         x_low, weight_low = x.detach().to(product), weight.detach().to(product)
         total = torch.promote_types(product, torch.float32)  # of sums over rows
         grad_x = torch.empty_like(x_low)
@@ -50,10 +49,7 @@ class _LinearCrossEntropy(torch.autograd.Function):
                 grad_bias += scores.sum(dim=0)
                 grad = scores.to(product)
                 torch.mm(grad, weight_low, out=grad_x[rows])
-                if total == product:
-                    grad_weight.addmm_(grad.T, x_low[rows])
-                else:
-                    grad_weight += grad.T @ x_low[rows]
+                add_product(grad_weight, grad.T, x_low[rows])
         ctx.save_for_backward(
             grad_x.to(x.dtype), grad_weight.to(weight.dtype), grad_bias.to(bias.dtype)
         )

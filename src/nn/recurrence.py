@@ -9,6 +9,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from src.nn.precision import add_product
+
 ROWS = 512  # sequences at a time: their states stay in the processor's cache
 _sigmoid_backward = torch.ops.aten.sigmoid_backward.grad_input
 _tanh_backward = torch.ops.aten.tanh_backward.grad_input
@@ -111,11 +113,3 @@ class _Recurrence(torch.autograd.Function):
         if metric is not None:
             d_metric = flat.T @ metric.transpose(0, 1).reshape(len(flat), -1).to(weight.dtype)
         return d_projected.to(product), d_weight, d_metric, None, None
-
-
-def add_product(total: Tensor, a: Tensor, b: Tensor) -> None:
-    """total += a b, in one pass where the dtypes allow it."""
-    if a.dtype == total.dtype:
-        total.addmm_(a, b)
-    else:
-        total += a @ b
