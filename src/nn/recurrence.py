@@ -1,7 +1,8 @@
 """The LSTM's recurrence over spirals, with a gradient of its own.
 
 Each step writes its gates, cells and hidden states into buffers, where the gradient finds them, and
-the gates' gradient takes the gates' place.
+the gates' gradient takes the gates' place. All four gates take one sigmoid: the cell gate is
+tanh(x) = 1 - 2 sigmoid(-2 x), with the -2 in its weights.
 """
 
 from __future__ import annotations
@@ -49,57 +50,62 @@ class _Recurrence(torch.autograd.Function):
         cells, hidden = torch.empty(2, kept, rows, width, **new)
         elements, ended = spirals.clamp(min=0).T.contiguous(), (spirals < 0).T[..., None]
         ends = ended.any(dim=1).flatten().tolist()
-        entering = projected.to(weight.dtype)
         product = projected.dtype
-        recurrent = weight.T.to(product)
+        cell_gate = _scales(width, -2.0, weight)
+        entering = projected.to(weight.dtype) * cell_gate
+        recurrent = (weight.T * cell_gate).to(product)
+        by_metric = None if metric is None else metric_weight.T * cell_gate
+        gate, cell, state = gates.unbind(), cells.unbind(), hidden.unbind()
+        i, f, g, o = _of_steps(gates)
         for step in range(length):
             now, before = step % kept, (step - 1) % kept
-            torch.index_select(entering, 0, elements[step], out=gates[now])
+            torch.index_select(entering, 0, elements[step], out=gate[now])
             if metric is not None:
-                gates[now].addmm_(metric[:, step].to(weight.dtype), metric_weight.T)
+                gate[now].addmm_(metric[:, step].to(weight.dtype), by_metric)
             if step > 0:
-                add_product(gates[now], hidden[before].to(product), recurrent)
-            i, f, g, o = gates[now].split(width, dim=1)
-            i.sigmoid_(), f.sigmoid_(), g.tanh_(), o.sigmoid_()
-            torch.mul(i, g, out=cells[now])
+                add_product(gate[now], state[before].to(product), recurrent)
+            gate[now].sigmoid_()
+            torch.addcmul(i[now], i[now], g[now], value=-2, out=cell[now])
             if step > 0:
-                cells[now].addcmul_(f, cells[before])
-            torch.tanh(cells[now], out=hidden[now]).mul_(o)
+                cell[now].addcmul_(f[now], cell[before])
+            torch.tanh(cell[now], out=state[now]).mul_(o[now])
             if ends[step]:
-                for state in (cells, hidden):
-                    torch.where(ended[step], state[before], state[now], out=state[now])
+                for each in (cell, state):
+                    torch.where(ended[step], each[before], each[now], out=each[now])
         ctx.save_for_backward(weight, elements, metric, gates, cells, hidden, ended)
         ctx.ends, ctx.product, ctx.vertices = ends, product, len(projected)
-        return hidden[(length - 1) % kept].clone()
+        return state[now].clone()
 
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx, grad):
         weight, elements, metric, gates, cells, hidden, ended = ctx.saved_tensors
         width, product = weight.shape[1], ctx.product
-        recurrent = weight.to(product)
+        cell_gate = _scales(width, 4.0, weight)  # of d sigmoid(-2 x), for that of tanh(x)
+        recurrent = (weight * cell_gate[:, None]).to(product)
         d_hidden, d_cell = grad.to(weight.dtype, copy=True), torch.zeros_like(hidden[0])
-        one, two, tanh = torch.empty(3, *d_cell.shape, dtype=weight.dtype, device=weight.device)
-        for step in reversed(range(len(gates))):
-            i, f, g, o = gates[step].split(width, dim=1)
+        one, tanh = torch.empty(2, *d_cell.shape, dtype=weight.dtype, device=weight.device)
+        d_gate = torch.empty_like(gates[0])
+        d_i, d_f, d_g, d_o = d_gate.split(width, dim=1)
+        gate, cell = gates.unbind(), cells.unbind()
+        i, f, g, o = _of_steps(gates)
+        for step in reversed(range(len(gate))):
             held = (d_hidden.clone(), d_cell.clone()) if ctx.ends[step] else None
-            torch.tanh(cells[step], out=tanh)
-            torch.mul(d_hidden, tanh, out=one), torch.mul(d_hidden, o, out=two)
-            _sigmoid_backward(one, o, grad_input=o)
-            d_cell += _tanh_backward(two, tanh, grad_input=two)
-            torch.mul(d_cell, g, out=one), torch.mul(d_cell, i, out=two)
-            _sigmoid_backward(one, i, grad_input=i)
-            _tanh_backward(two, g, grad_input=g)
+            torch.tanh(cell[step], out=tanh)
+            torch.mul(d_hidden, tanh, out=d_o), torch.mul(d_hidden, o[step], out=one)
+            d_cell += _tanh_backward(one, tanh, grad_input=one)
+            torch.addcmul(d_cell, d_cell, g[step], value=-2, out=d_i)
+            torch.mul(d_cell, i[step], out=d_g)
             if step > 0:
-                torch.mul(d_cell, cells[step - 1], out=one)
-                d_cell *= f
-                _sigmoid_backward(one, f, grad_input=f)
+                torch.mul(d_cell, cell[step - 1], out=d_f)
+                d_cell *= f[step]
             else:
-                f.zero_()
+                d_f.zero_()
+            _sigmoid_backward(d_gate, gate[step], grad_input=gate[step])
             if held:
-                gates[step].masked_fill_(ended[step], 0.0)
+                gate[step].masked_fill_(ended[step], 0.0)
             if step > 0:
-                d_hidden = (gates[step].to(product) @ recurrent).to(weight.dtype)
+                d_hidden = (gate[step].to(product) @ recurrent).to(weight.dtype)
             if held:
                 d_hidden += held[0] * ended[step]
                 torch.where(ended[step], held[1], d_cell, out=d_cell)
@@ -112,4 +118,19 @@ class _Recurrence(torch.autograd.Function):
         d_metric = None
         if metric is not None:
             d_metric = flat.T @ metric.transpose(0, 1).reshape(len(flat), -1).to(weight.dtype)
+            d_metric *= cell_gate[:, None]
+        d_projected *= cell_gate
+        d_weight *= cell_gate[:, None]
         return d_projected.to(product), d_weight, d_metric, None, None
+
+
+def _of_steps(gates: Tensor) -> list[tuple[Tensor, ...]]:
+    """Of [N, R, 4 H]: for each of the four gates its [R, H] in every step."""
+    return [gate.unbind() for gate in gates.chunk(4, dim=2)]
+
+
+def _scales(width: int, scale: float, like: Tensor) -> Tensor:
+    """[4 width]: scale in the place of the cell gate, the third, and 1 elsewhere."""
+    scales = like.new_ones(4, width)
+    scales[2] = scale
+    return scales.view(-1)
