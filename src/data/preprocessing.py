@@ -13,7 +13,7 @@ from scipy.sparse import csr_array
 from tqdm import tqdm
 
 from src.data.store import Arrays, Store, code_version, digest
-from src.geometry import connectivity, geodesics, mesh, patches, shot, spirals, windows
+from src.geometry import angles, connectivity, geodesics, mesh, patches, shot, spirals, windows
 from src.geometry.mesh import Mesh, MeshError
 
 
@@ -58,7 +58,7 @@ class Task:
 
 def descriptor_task(mesh_: Mesh, recipe: Recipe) -> Task:
     """SHOT: `features` float32 [V, 32 (bins + 1)], zeros where undefined; `undefined`: how many."""
-    version = code_version(mesh, shot, sys.modules[__name__])
+    version = code_version(angles, mesh, shot, sys.modules[__name__])
     key = digest(mesh_.vertices, mesh_.faces, recipe.shot_radius, recipe.shot_bins, version)
     return Task("shot", key, _descriptors, (mesh_, recipe.shot_radius, recipe.shot_bins))
 

@@ -18,6 +18,8 @@ import math
 import numpy as np
 from numba import njit
 
+from src.geometry.angles import arccos, eighth
+
 SECTORS = 32  # 8 of azimuth x 2 of radius x 2 of elevation
 LEAST_NEIGHBOURS = 5  # away from the centre; with fewer there is no local frame
 MOST_CELLS = 2**21 - 3  # along an axis of the search grid, so that three indices fit an int64
@@ -257,7 +259,7 @@ def _vote(offset, distance, normals, index, m, frame, radius, bins, wrap, histog
 
         place = (1 + min(max(cosine, -1.0), 1.0)) * bins / 2
         bin_ = int(place + 0.5)
-        azimuth = _azimuth_sector(x, y)
+        azimuth, turned = eighth(x, y)
         outer, upper = int(d > radius / 2), int(z > 0)
         sector = 4 * azimuth + 2 * outer + upper
         cell = sector * (bins + 1) + bin_
@@ -273,28 +275,12 @@ def _vote(offset, distance, normals, index, m, frame, radius, bins, wrap, histog
         weight += 1 - abs(e)
         histogram[(sector ^ 2) * (bins + 1) + bin_] += max(-e if outer else e, 0.0)
 
-        e = math.acos(min(max(z / d, -1.0), 1.0)) * (2 / math.pi) - (0.5 if upper else 1.5)
+        e = arccos(min(max(z / d, -1.0), 1.0)) * (2 / math.pi) - (0.5 if upper else 1.5)
         weight += 1 - abs(e)
         histogram[(sector ^ 1) * (bins + 1) + bin_] += max(e if upper else -e, 0.0)
 
         if x != 0 or y != 0:
-            e = math.atan2(y, x) * (4 / math.pi) + 3.5 - azimuth
-            e = min(max(e, -0.5), 0.5)
-            weight += 1 - abs(e)
-            beside = (sector + (4 if e > 0 else -4)) % SECTORS
-            histogram[beside * (bins + 1) + bin_] += abs(e)
+            weight += 1 - abs(turned)
+            beside = (sector + (4 if turned > 0 else -4)) % SECTORS
+            histogram[beside * (bins + 1) + bin_] += abs(turned)
         histogram[cell] += weight
-
-
-@njit(cache=True, error_model="numpy")
-def _azimuth_sector(x, y):
-    """Which half-open eighth (-pi + a pi/4, -pi + (a + 1) pi/4] the angle of (x, y) is in.
-
-    By comparisons alone, so that rounding cannot move a point on a border; 0 at the origin.
-    """
-    first = 0
-    if y > 0 or (y == 0 and x < 0):
-        first, x, y = 4, -x, -y
-    if x <= 0:
-        return first + (0 if y >= x else 1)
-    return first + (2 if -y >= x else 3)

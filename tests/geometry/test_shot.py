@@ -12,7 +12,7 @@ import pytest
 import trimesh
 
 from src.geometry.mesh import Mesh
-from src.geometry.shot import _azimuth_sector, _descriptors_and_frames, shot_descriptors
+from src.geometry.shot import _descriptors_and_frames, shot_descriptors
 
 DATA = Path(__file__).parents[1] / "data" / "shot"
 
@@ -187,15 +187,6 @@ def test_a_point_at_the_radius_is_no_neighbour():
     without = shot_descriptors(vertices[kept], normals[kept], 3.0)
     rows = shot_descriptors(vertices, normals, 3.0)
     np.testing.assert_allclose(rows[0], without[0], rtol=0, atol=1e-6)
-
-
-def test_azimuth_sectors_hold_their_upper_border():
-    ends = [(-1, -1), (0, -1), (1, -1), (1, 0), (1, 1), (0, 1), (-1, 1), (-1, 0)]
-    assert [_azimuth_sector(x, y) for x, y in ends] == list(range(8))
-    middles = np.radians(22.5 + 45 * np.arange(-4, 4))
-    assert [_azimuth_sector(np.cos(t), np.sin(t)) for t in middles] == list(range(8))
-    assert _azimuth_sector(-1.0, -0.0) == 7
-    assert _azimuth_sector(0.0, 0.0) == 0
 
 
 @pytest.mark.parametrize("seed", range(3))
