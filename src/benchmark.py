@@ -12,11 +12,11 @@ from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 
-import numpy as np
 import torch
 from omegaconf import DictConfig, OmegaConf
 from tqdm import tqdm
 
+from src import growth as growing
 from src import measure
 from src.cli import entry_point
 from src.config import ConfigError, typed
@@ -32,8 +32,8 @@ from src.data.preprocessing import (
 )
 from src.data.sources import open_shapes
 from src.data.store import Store
+from src.figures import growth_figure
 from src.nn.geodesic import Resampling
-from src.nn.loss import linear_cross_entropy
 from src.nn.networks import GCNN3, FCSNet, LSTMNet
 from src.plain import PlainNetwork
 from src.runs import write_whole
@@ -43,8 +43,6 @@ log = logging.getLogger("src.benchmark")
 
 SHOT_RADIUS, PATCH_RADIUS = 0.16, 0.08  # as in conf/
 LARGE = (20_000, 100_000)  # vertices of a mesh and of a template that must fit into memory
-SIZES = [1500, 3000, 6000, 12_000, 25_000, 50_000, 100_000]
-LENGTHS = [10, 15, 20, 30, 40, 60]
 Row = dict[str, object]
 
 
@@ -92,6 +90,8 @@ def main(config: DictConfig) -> None:
         result[part] = PARTS[part](config)
         log.info("%s", "\n".join(lines(part, result[part])))
         write_whole(folder / "benchmark.json", json.dumps(result, indent=2) + "\n")
+        if part == "growth":
+            growth_figure(result[part]).savefig(folder / "growth.png", dpi=150)
     log.info("%s", folder / "benchmark.json")
 
 
@@ -225,36 +225,8 @@ def preprocessing(config: DictConfig) -> list[Row]:
 
 
 def growth(config: DictConfig) -> list[Row]:
-    """Seconds over one size at a time, and the exponent over the upper half of the sizes."""
-    rows: list[Row] = []
-
-    def series(what: str, sizes: list[int], make) -> None:
-        seconds = []
-        for size in tqdm(sizes, desc=what):
-            seconds.append(measure.medians({"it": make(size)}, config.repeats)["it"])
-        upper = slice(len(sizes) // 2, None)
-        slope = np.polyfit(np.log(sizes[upper]), np.log(seconds[upper]), 1)[0]
-        rows.append({"what": what, "sizes": sizes, "exponent": float(slope),
-                     "seconds": [round(s, 4) for s in seconds]})  # fmt: skip
-
-    def without_head(vertices: int, seq_len: int):
-        features, spirals, _ = measure.random_inputs(vertices, 10, seq_len)
-        net = FCSNet(544, 10, seq_len, feature_scale=measure.SCALE)
-        return lambda: net.embed(features, spirals).sum().backward()
-
-    def head(vertices: int, classes: int):
-        x, weight = torch.randn(vertices, 256, requires_grad=True), torch.randn(classes, 256) / 16
-        weight.requires_grad_()
-        labels, bias = torch.randint(classes, (vertices,)), torch.zeros(classes)
-        return lambda: linear_cross_entropy(x, weight, bias, labels).backward()
-
-    series("FCS-NET without its head, over vertices", SIZES,
-           lambda vertices: without_head(vertices, config.seq_len))  # fmt: skip
-    series("FCS-NET without its head, over N", LENGTHS,
-           lambda length: without_head(config.vertices, length))  # fmt: skip
-    series("head, over the template", SIZES, lambda classes: head(1500, classes))
-    series("head, over vertices", SIZES, lambda vertices: head(vertices, 1500))
-    return rows
+    """Seconds and megabytes over one size at a time, and their exponents."""
+    return growing.growth(config.repeats)
 
 
 PARTS = {"steps": steps, "memory": memory, "preprocessing": preprocessing, "growth": growth}

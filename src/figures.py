@@ -36,6 +36,29 @@ def curve_figure(curves: dict[str, tuple[np.ndarray, np.ndarray]]) -> Figure:
     return figure
 
 
+def growth_figure(series: list[dict]) -> Figure:
+    """Seconds and megabytes of a pass over its sizes, both axes logarithmic.
+
+    series: as `src.growth.growth` gives them. Dashed: what is proportional to the size.
+    """
+    overs, units = list(dict.fromkeys(row["over"] for row in series)), ("seconds", "MB")
+    figure = Figure(figsize=(3.4 * len(overs), 5.6), layout="constrained")
+    axes = figure.subplots(2, len(overs), squeeze=False)
+    for column, over in enumerate(overs):
+        for unit, ax in zip(units, axes[:, column], strict=True):
+            for row in series:
+                if row["over"] == over and None not in row[unit]:
+                    label = f"{row['what']}, {row[f'exponent of {unit}']:.2f}"
+                    [line] = ax.loglog(row["sizes"], row[unit], "o-", ms=3, lw=1.4, label=label)
+                    end = row[unit][-1] / row["sizes"][-1]
+                    ax.loglog(row["sizes"], [end * size for size in row["sizes"]], "--", lw=0.8,
+                              color=line.get_color())  # fmt: skip
+            ax.set(xlabel=over, ylabel=unit)
+            ax.grid(alpha=0.3)
+            ax.legend(fontsize="small", title="exponent", title_fontsize="small")
+    return figure
+
+
 def template_colors(template: Mesh) -> np.ndarray:
     """float [K, 3] in 0..1: a colour for each template vertex, from its place in the bounding box.
 

@@ -24,6 +24,7 @@ ALLOWED = {
     "trainer": {"callbacks", "config"},
     "plain": {"nn"},
     "measure": {"nn", "plain"},
+    "growth": {"measure", "nn", "data"},
     "summary": {"correspondence", "data", "figures", "metrics"},
     "cli": {"config", "runs", "data", "geometry"},
 }

@@ -8,7 +8,7 @@ import pytest
 import torch
 from torch.utils._python_dispatch import TorchDispatchMode
 
-from src import benchmark, measure
+from src import benchmark, growth, measure
 from src.nn.networks import GCNN3, FCSNet, LSTMNet
 from src.plain import PlainNetwork
 from tests.nn.test_geodesic import as_resampling, patches
@@ -76,8 +76,12 @@ def test_a_plain_step_trains_too():
 def test_every_part_has_its_table_and_its_place_in_the_file(cli, tmp_path, monkeypatch):  # noqa: F811
     monkeypatch.setattr(benchmark, "networks", networks)
     monkeypatch.setattr(benchmark, "LARGE", (60, 90))
-    monkeypatch.setattr(benchmark, "SIZES", [50, 100, 200, 400])
-    monkeypatch.setattr(benchmark, "LENGTHS", [2, 4, 6])
+    series = [
+        ("FCS-NET", "N", [2, 4]),
+        ("GCNN3", "vertices", [50, 100]),
+        ("head", "template", [9, 99]),
+    ]
+    monkeypatch.setattr(growth, "SERIES", series)
     shapes = benchmark.open_shapes({"name": "bodies", "vertices": 1500})
     shapes.names = {split: names[:1] for split, names in shapes.names.items()}
     monkeypatch.setattr(benchmark, "open_shapes", lambda _: shapes)
@@ -91,7 +95,27 @@ def test_every_part_has_its_table_and_its_place_in_the_file(cli, tmp_path, monke
         assert f"{row['ours / products']:.3f}" in out
     assert [row["what"] for row in result["preprocessing"]][-1] == "all three"
     assert {row["template"] for row in result["memory"]} == {1500, 90}
-    assert len(result["growth"]) == 4 and "exponent" in out
+    assert [row["what"] for row in result["growth"]] == ["FCS-NET", "GCNN3", "head"]
+    assert all(len(row["seconds"]) == len(row["MB"]) == 2 for row in result["growth"])
+    assert (tmp_path / "out" / "growth.png").stat().st_size > 10_000
+
+
+def test_the_exponent_is_that_of_the_upper_half():
+    sizes = [1, 2, 4, 8, 16, 32]
+    assert growth.exponent(sizes, [1e3, 1e3, 1e3, 64, 256, 1024]) == pytest.approx(2)
+    assert growth.exponent(sizes, [None] * 6) is None
+
+
+@pytest.mark.parametrize("what", ["FCS-NET", "LSTM-NET", "GCNN3", "head"])
+def test_growth_is_measured_on_passes_of_the_size_asked_for(what):
+    small = {"vertices": 300, "template": 20, "N": 4}
+    with Products() as once:
+        growth.one_pass(what, **small)()
+    with Products() as twice:
+        growth.one_pass(what, **small | {"vertices": 600})()
+    # the weights of GCNN3 are transformed, however many vertices there are
+    assert (1.5 if what == "GCNN3" else 2) * once.operations <= twice.operations
+    assert 0 < twice.operations <= 2 * once.operations
 
 
 @pytest.mark.parametrize(
