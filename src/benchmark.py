@@ -37,7 +37,7 @@ from src.nn.geodesic import Resampling
 from src.nn.networks import GCNN3, FCSNet, LSTMNet
 from src.plain import PlainNetwork
 from src.runs import write_whole
-from src.trainer import choose_precision, keep_freed_memory
+from src.trainer import choose_precision, device_of, keep_freed_memory
 
 log = logging.getLogger("src.benchmark")
 
@@ -59,8 +59,7 @@ class Benchmark:
 
 def check(config: DictConfig) -> DictConfig:
     checked = typed(config, Benchmark)
-    for key, values in {"vertices": (1500, 6890), "accelerator": ("cpu", "gpu"),
-                        "precision": ("32", "bf16", "auto")}.items():  # fmt: skip
+    for key, values in {"vertices": (1500, 6890), "precision": ("32", "bf16", "auto")}.items():
         if checked[key] not in values:
             raise ConfigError(f"{key} must be one of {', '.join(map(str, values))}; "
                               f"got {checked[key]}")  # fmt: skip
@@ -70,8 +69,7 @@ def check(config: DictConfig) -> DictConfig:
     for part in checked.parts:
         if part not in PARTS:
             raise ConfigError(f"parts must be of {', '.join(PARTS)}; got {part}")
-    if checked.accelerator == "gpu" and not torch.cuda.is_available():
-        raise ConfigError("accelerator=gpu: torch finds no GPU here")
+    device_of(checked.accelerator)
     return checked
 
 
@@ -156,7 +154,7 @@ def networks(seq_len: int, classes: int) -> dict[str, torch.nn.Module]:
 
 def steps(config: DictConfig) -> list[Row]:
     """Forward, backward and Adam: ours, plain (float32), the matrix products alone."""
-    device = "cuda" if config.accelerator == "gpu" else "cpu"
+    device = device_of(config.accelerator)
     precision = choose_precision(config.precision, config.accelerator)
     dtype = torch.bfloat16 if precision == "bf16-mixed" else torch.float32
     features, labels, table, spirals, resampling = inputs(

@@ -16,6 +16,9 @@ from lightning.pytorch.callbacks import Callback, ModelCheckpoint, ProgressBar
 from lightning.pytorch.plugins.io import TorchCheckpointIO
 from tqdm import tqdm
 
+from src.figures import curve_figure, sketch_figure, template_colors
+from src.metrics import THRESHOLDS
+from src.render import upright
 from src.runs import LAST, Stopped
 
 
@@ -166,6 +169,41 @@ class Speed(Callback):
 
     def load_state_dict(self, state: dict[str, float]) -> None:
         self._earlier = state["seconds"]
+
+
+class Looks(Callback):
+    """Into TensorBoard: the curve of validation, and a validation shape, each vertex in the colour
+    of its counterpart; after the first validation, and then as often as 1 % of the time allows.
+    At the end the curve of the test."""
+
+    SHARE = 0.01
+
+    def __init__(self) -> None:
+        self._spent, self._began = 0.0, 0.0
+
+    def on_train_start(self, trainer: L.Trainer, module: L.LightningModule) -> None:
+        self._began = time.perf_counter()
+
+    def on_validation_end(self, trainer: L.Trainer, module: L.LightningModule) -> None:
+        now = time.perf_counter()
+        if not trainer.training or self._spent > self.SHARE * (now - self._began):
+            return
+        self._curve(trainer, module, "val")
+        if trainer.is_global_zero and trainer.logger is not None:
+            data = trainer.datamodule
+            mesh = data.shape(data.shapes.names["val"][0]).mesh
+            colors = template_colors(data.shapes.template)[module.results["val"][0].predicted]
+            figure = sketch_figure(upright(mesh.vertices, data.shapes.up), mesh.faces, colors)
+            trainer.logger.experiment.add_figure("val/shape", figure, trainer.current_epoch)
+        self._spent += time.perf_counter() - now
+
+    def on_test_end(self, trainer: L.Trainer, module: L.LightningModule) -> None:
+        self._curve(trainer, module, "test")
+
+    def _curve(self, trainer: L.Trainer, module: L.LightningModule, split: str) -> None:
+        if trainer.is_global_zero and trainer.logger is not None:
+            figure = curve_figure({split: (THRESHOLDS, module.curves[split])})
+            trainer.logger.experiment.add_figure(f"{split}/curve", figure, trainer.current_epoch)
 
 
 class OrderlyStop(Callback):

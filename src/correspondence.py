@@ -11,8 +11,8 @@ import torch
 from torch import Tensor, nn
 
 from src.data.datamodule import Batch, derived_seed
-from src.figures import curve_figure
-from src.metrics import THRESHOLDS, CorrespondenceError, geodesic_errors
+from src.evaluation import Result, result_of
+from src.metrics import CorrespondenceError
 from src.nn.geodesic import Resampling
 from src.nn.layers import metric_features
 from src.nn.loss import linear_cross_entropy, predict
@@ -52,7 +52,7 @@ class Correspondence(L.LightningModule):
         # of the latest evaluation of each split; a checkpoint brings those of validation along
         self.figures: dict[str, dict[str, float]] = {}
         self.curves: dict[str, np.ndarray] = {}
-        self.predictions: dict[int, np.ndarray] = {}  # of the latest test, by mesh
+        self.results: dict[str, dict[int, Result]] = {}  # likewise, by mesh
 
     def setup(self, stage: str) -> None:
         self.distances = self.trainer.datamodule.reference
@@ -80,17 +80,26 @@ class Correspondence(L.LightningModule):
         self._evaluate("val", batch)
 
     def test_step(self, batch: Batch, batch_idx: int) -> None:
-        self.predictions[batch["index"]] = self._evaluate("test", batch)
+        self._evaluate("test", batch)
 
-    def _evaluate(self, split: str, batch: Batch) -> np.ndarray:
+    def predict(self, batch: Batch) -> tuple[np.ndarray, Tensor]:
+        """int64 [V], the vertex of the template that each vertex gets; and the mean loss."""
         x, head = self.embed(batch), self.net.head
         predicted, loss = predict(x, head.weight, head.bias, batch["labels"])
+        return predicted.cpu().numpy(), loss
+
+    def _evaluate(self, split: str, batch: Batch) -> None:
+        predicted, loss = self.predict(batch)
         self.log(f"{split}/loss", loss, batch_size=1, sync_dist=True)
-        predicted = predicted.cpu().numpy()
-        labels = batch["labels"].cpu().numpy()
-        errors = geodesic_errors(predicted, labels, self.distances)
-        self.errors[split].update(errors, predicted == labels)
-        return predicted
+        result = result_of(predicted, batch, self.distances)
+        self.results[split][batch["index"]] = result
+        self.errors[split].update(result.errors, predicted == batch["labels"].cpu().numpy())
+
+    def on_validation_epoch_start(self) -> None:
+        self.results["val"] = {}
+
+    def on_test_epoch_start(self) -> None:
+        self.results["test"] = {}
 
     def on_validation_epoch_end(self) -> None:
         self._report("val")
@@ -106,11 +115,13 @@ class Correspondence(L.LightningModule):
         self.figures[split] = {f"{split}/{name}": float(value) for name, value in values.items()}
         # already over all meshes of all ranks, so nothing is left to average
         self.log_dict(self.figures[split], batch_size=1, sync_dist=True)
-        if self.logger is not None:
-            figure = curve_figure({split: (THRESHOLDS, self.curves[split])})
-            self.logger.experiment.add_figure(f"{split}/curve", figure, self.current_epoch)
+        if self.trainer.world_size > 1:
+            shares: list[Any] = [None] * self.trainer.world_size
+            torch.distributed.all_gather_object(shares, self.results[split])
+            self.results[split] = {i: mesh for share in shares for i, mesh in share.items()}
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        checkpoint["template"] = self.trainer.datamodule.template_key
         if "val" in self.curves:
             checkpoint["validation"] = (self.figures["val"], torch.from_numpy(self.curves["val"]))
 

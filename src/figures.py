@@ -1,39 +1,71 @@
-"""Curves and pictures."""
+"""Curves and pictures, by matplotlib. None belongs to a window system: `figure.savefig(path)`."""
 
 from __future__ import annotations
 
-import os
-import sys
-from concurrent.futures import ProcessPoolExecutor
-from concurrent.futures.process import BrokenProcessPool
-from multiprocessing import get_context
-from pathlib import Path
+import io
+from collections.abc import Mapping
 
 import numpy as np
+from matplotlib import colormaps, rc_context
+from matplotlib.cm import ScalarMappable
+from matplotlib.collections import PolyCollection
+from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 
 from src.geometry.mesh import Mesh
 
+ERROR_LABEL = r"geodesic error / $\sqrt{\mathrm{area}}$"
+MOST_ERROR = 0.2  # where colours end, as in the paper
+ERROR_COLORS = colormaps["magma_r"]  # darker with every step, also in greyscale
+DPI = 160
 
-class RenderError(RuntimeError):
-    """There is no picture; the message says what is missing."""
 
-
-def curve_figure(curves: dict[str, tuple[np.ndarray, np.ndarray]]) -> Figure:
+def curve_figure(curves: Mapping[str, tuple[np.ndarray, np.ndarray]]) -> Figure:
     """The share of correct matches over the geodesic error (Kim et al. 2011).
 
-    curves: by name, thresholds [T] over sqrt(area) and shares [T] in 0..1. The figure belongs to no
-    window system: save it with `figure.savefig(path)`.
+    curves: by name, thresholds [T] over sqrt(area), and shares in 0..1: [T], or [R, T] of several
+    runs: their mean, and a band from the least to the most.
     """
     figure = Figure(figsize=(4.8, 3.6), layout="constrained")
     axes = figure.add_subplot()
     for name, (thresholds, shares) in curves.items():
-        axes.plot(thresholds, 100 * shares, label=name, linewidth=1.8)
-    axes.set(xlabel=r"geodesic error / $\sqrt{\mathrm{area}}$", ylabel="correct matches (%)",
-             xlim=(0, thresholds[-1]), ylim=(0, 100))  # fmt: skip
+        several = 100 * np.atleast_2d(shares)
+        [line] = axes.plot(thresholds, several.mean(axis=0), label=name, linewidth=1.6)
+        if len(several) > 1:
+            axes.fill_between(thresholds, several.min(axis=0), several.max(axis=0), alpha=0.25,
+                              color=line.get_color(), linewidth=0)  # fmt: skip
+    axes.set(xlabel=ERROR_LABEL, ylabel="correct matches (%)", xlim=(0, thresholds[-1]),
+             ylim=(0, 100))  # fmt: skip
     axes.grid(alpha=0.3)
-    axes.legend(loc="lower right")
+    axes.legend(loc="lower right", fontsize="small")
     return figure
+
+
+def all_curves_figure(thresholds: np.ndarray, shares: np.ndarray) -> Figure:
+    """Every curve of [R, T] in one figure, and within it the same in an enlargement of their
+    spread about the mean, in points."""
+    figure = Figure(figsize=(4.8, 3.6), layout="constrained")
+    axes = figure.add_subplot()
+    axes.plot(thresholds, 100 * shares.T, color="C0", alpha=0.15, linewidth=0.8)
+    axes.set(xlabel=ERROR_LABEL, ylabel="correct matches (%)", xlim=(0, thresholds[-1]),
+             ylim=(0, 100), title=f"{len(shares)} runs, each with other spirals")  # fmt: skip
+    axes.grid(alpha=0.3)
+    inset = axes.inset_axes((0.45, 0.15, 0.5, 0.4))
+    inset.plot(thresholds, 100 * (shares - shares.mean(axis=0)).T, color="C0", alpha=0.15, lw=0.8)
+    inset.set_title("from their mean, in points", fontsize="small")
+    inset.set_xlim(0, thresholds[-1])
+    inset.tick_params(labelsize="small")
+    inset.grid(alpha=0.3)
+    return figure
+
+
+def encoded(figure: Figure, kind: str) -> bytes:
+    """The figure as a "png", "pdf" or "svg" file: the same bytes for the same figure."""
+    when = {"pdf": "CreationDate", "svg": "Date"}.get(kind)
+    buffer = io.BytesIO()
+    with rc_context({"svg.hashsalt": "figure"}):
+        figure.savefig(buffer, format=kind, dpi=DPI, metadata={when: None} if when else None)
+    return buffer.getvalue()
 
 
 def growth_figure(series: list[dict]) -> Figure:
@@ -53,6 +85,10 @@ def growth_figure(series: list[dict]) -> Figure:
                     end = row[unit][-1] / row["sizes"][-1]
                     ax.loglog(row["sizes"], [end * size for size in row["sizes"]], "--", lw=0.8,
                               color=line.get_color())  # fmt: skip
+            sizes = sorted({size for row in series if row["over"] == over for size in row["sizes"]})
+            names = [f"{size / 1000:g} k" if size >= 1000 else str(size) for size in sizes]
+            ax.minorticks_off()
+            ax.set_xticks(sizes, names, fontsize="small")
             ax.set(xlabel=over, ylabel=unit)
             ax.grid(alpha=0.3)
             ax.legend(fontsize="small", title="exponent", title_fontsize="small")
@@ -68,56 +104,56 @@ def template_colors(template: Mesh) -> np.ndarray:
     return 0.1 + 0.9 * (template.vertices - low) / np.maximum(high - low, 1e-12)
 
 
-def render_row(
-    path: str | Path, meshes: list[Mesh], colors: list[np.ndarray], captions: list[str], up: str
-) -> None:
-    """Write a PNG of meshes side by side, as seen from the front.
+def error_colors(errors: np.ndarray) -> np.ndarray:
+    """float [V, 3] in 0..1: from pale, right, to dark, an error of 0.2 sqrt(area) and more."""
+    return ERROR_COLORS(np.asarray(errors) / MOST_ERROR)[:, :3]
 
-    colors: for each mesh [V, 3] in 0..1. up: the axis that points up, "y" (the front is then +z) or
-    "z" (-y). No display is needed, but an OpenGL library is. Errors: RenderError without one.
+
+def picture_figure(
+    images: list[np.ndarray], middles: np.ndarray, captions: list[str], error_bar: bool = False
+) -> Figure:
+    """Views of a row of meshes, one below the other, with captions, and the colours of errors.
+
+    images, middles: a `src.render.Picture`.
     """
-    # VTK ends the whole process where it finds no OpenGL: so it has one of its own
-    with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as process:
-        try:
-            process.submit(_render_row, path, meshes, colors, captions, up).result()
-        except (BrokenProcessPool, ImportError) as error:
-            raise RenderError(
-                "VTK could not draw; it needs an OpenGL library (on Debian: libegl1, libgl1)"
-            ) from error
+    height, width = images[0].shape[:2]
+    inches = width / DPI
+    bar = 0.9 if error_bar else 0.0
+    figure = Figure(figsize=(inches + bar, (height / DPI) * len(images) + 0.25))
+    figure.set_dpi(DPI)
+    tall = figure.get_figheight()
+    share = height / DPI / tall
+    for row, image in enumerate(images):
+        axes = figure.add_axes((0, 1 - (row + 1) * share, inches / (inches + bar), share))
+        axes.imshow(image)
+        axes.axis("off")
+    for middle, caption in zip(middles, captions, strict=True):
+        figure.text(middle * inches / (inches + bar), 0.08 / tall, caption, ha="center", fontsize=8)
+    if error_bar:
+        axes = figure.add_axes((inches / (inches + bar), 0.2, 0.12 / (inches + bar), 0.6))
+        scale = ScalarMappable(Normalize(0, MOST_ERROR), ERROR_COLORS)
+        figure.colorbar(scale, cax=axes, extend="max", label=ERROR_LABEL)
+    return figure
 
 
-def _render_row(path, meshes, colors, captions, up) -> None:
-    if sys.platform == "linux" and "DISPLAY" not in os.environ:
-        os.environ.setdefault("VTK_DEFAULT_OPENGL_WINDOW", "vtkEGLRenderWindow")
-    import pyvista  # takes seconds
+def sketch_figure(points: np.ndarray, faces: np.ndarray, colors: np.ndarray) -> Figure:
+    """A mesh as seen from +z, y up, drawn face by face: rough, in a tenth of a second.
 
-    axes = {"y": (0, 1, 2), "z": (0, 2, 1)}[up]
-    placed, left = [], 0.0
-    for mesh in meshes:
-        points = mesh.vertices[:, axes] * ([1, 1, -1] if up == "z" else [1, 1, 1])
-        low, high = points.min(axis=0), points.max(axis=0)
-        points = points - [low[0] - left, (low[1] + high[1]) / 2, (low[2] + high[2]) / 2]
-        left = points[:, 0].max()
-        placed.append(points)
-    tall = max(np.ptp(points[:, 1]) for points in placed)
-    gap = 0.08 * tall
-    width, height = left + gap * (len(meshes) + 1), 1.2 * tall
-    plotter = pyvista.Plotter(off_screen=True, window_size=(int(640 * width / height), 640))
-    plotter.set_background("white")
-    for i, (points, mesh, color) in enumerate(zip(placed, meshes, colors, strict=True)):
-        points[:, 0] += gap * (i + 1)
-        surface = pyvista.make_tri_mesh(points, mesh.faces)
-        plotter.add_mesh(surface, scalars=np.round(255 * color).astype(np.uint8), rgb=True,
-                         smooth_shading=True, ambient=0.25)  # fmt: skip
-    below = [[(p[:, 0].min() + p[:, 0].max()) / 2, -0.57 * tall, 0] for p in placed]
-    plotter.add_point_labels(np.array(below), captions, shape=None, show_points=False,
-                             text_color="black", font_size=18, bold=False, always_visible=True,
-                             justification_horizontal="center")  # fmt: skip
-    plotter.view_xy()
-    plotter.enable_parallel_projection()
-    plotter.camera.focal_point = (width / 2, 0, 0)
-    plotter.camera.position = (width / 2, 0, 10 * tall)
-    plotter.camera.parallel_scale = height / 2
-    plotter.reset_camera_clipping_range()
-    plotter.screenshot(str(path))
-    plotter.close()
+    points: float [V, 3]. colors: float [V, 3] in 0..1.
+    """
+    corners = points[faces]
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    facing = normals[:, 2] / np.maximum(np.linalg.norm(normals, axis=1), 1e-300)
+    seen = np.flatnonzero(facing > 0)
+    seen = seen[np.argsort(corners[seen, :, 2].mean(axis=1))]
+    shade = 0.35 + 0.65 * facing[seen, None]
+    size = np.ptp(points, axis=0)
+    figure = Figure(figsize=(max(1.0, 5 * size[0] / size[1]), 5))
+    axes = figure.add_axes((0, 0, 1, 1))
+    paint = shade * colors[faces[seen]].mean(axis=1)
+    axes.add_collection(PolyCollection(corners[seen, :, :2], facecolors=paint, edgecolors=paint,
+                                       linewidths=0.3))  # fmt: skip
+    axes.autoscale_view()
+    axes.set_aspect("equal")
+    axes.axis("off")
+    return figure

@@ -11,6 +11,7 @@ from src.data.preprocessing import by_rows_and_columns
 from src.nn.geodesic import Resampling
 from src.nn.loss import linear_cross_entropy
 from src.nn.networks import GCNN3, FCSNet, LSTMNet
+from src.trainer import keep_freed_memory
 
 VERTICES, TEMPLATE, LENGTH = 6890, 1500, 20  # what does not grow
 SIZES = [1500, 3000, 6000, 12_000, 25_000, 50_000, 100_000]
@@ -56,6 +57,7 @@ def exponent(sizes: list[int], values: list[float | None]) -> float | None:
 def cost(what: str, over: str, size: int, repeats: int) -> tuple[float, float | None]:
     """(seconds, megabytes) of one pass, in a process that has done nothing else."""
     torch.set_flush_denormal(True)
+    keep_freed_memory()  # as in training
     action = one_pass(what, **{over: size})
     peak = measure.peak_bytes(action)
     seconds = measure.medians({"it": action}, repeats)["it"]

@@ -30,6 +30,28 @@ def geodesic_errors(
     return distances(labels, predicted)
 
 
+def point_errors(
+    predicted: np.ndarray,
+    corners: np.ndarray,
+    weights: np.ndarray,
+    distances: Callable[[np.ndarray, np.ndarray], np.ndarray],
+    place: np.ndarray,
+) -> np.ndarray:
+    """float64 [V]: how far the predicted vertex is from a point within a face of the template.
+
+    predicted: int64 [V]. corners: int64 [V, 3] and weights: float [V, 3], the point. distances: as
+    above. place: float [K, 3], the template's vertices in the unit of the distances. From a corner
+    of the face it is a straight line; else the corners' distances, interpolated linearly.
+    """
+    error = np.zeros(len(predicted))
+    for corner, weight in zip(corners.T, weights.T, strict=True):
+        error += weight * distances(corner, predicted)
+    within = (corners == predicted[:, None]).any(axis=1)
+    point = np.einsum("vk,vkx->vx", weights[within], place[corners[within]])
+    error[within] = np.linalg.norm(point - place[predicted[within]], axis=1)
+    return error
+
+
 def correspondence_curve(errors: np.ndarray, thresholds: np.ndarray = THRESHOLDS) -> np.ndarray:
     """float64 [T]: the share of errors that are at most each threshold (Kim et al. 2011).
 

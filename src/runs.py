@@ -9,7 +9,7 @@ from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
 
-from src.config import flat
+from src.config import ConfigError, checked, flat
 
 CONFIG, METRICS = "config.yaml", "metrics.json"
 BEST, LAST = "checkpoints/best.ckpt", "checkpoints/last.ckpt"
@@ -29,10 +29,10 @@ class Stopped(BaseException):
         self.signum = signum
 
 
-def write_whole(path: Path, text: str) -> None:
+def write_whole(path: Path, content: str | bytes) -> None:
     """Write a file that appears whole or not at all."""
     temporary = path.with_name(path.name + ".tmp")
-    temporary.write_text(text)
+    temporary.write_bytes(content if isinstance(content, bytes) else content.encode())
     os.replace(temporary, path)
 
 
@@ -91,6 +91,34 @@ def continued(config: DictConfig, overrides: list[str]) -> DictConfig:
             OmegaConf.update(stored, key, new)
     stored.resume = None
     return stored
+
+
+def read_checkpoint(path: Path) -> dict[str, Any]:
+    """What a checkpoint holds, by names. Nothing in it is executed.
+
+    Errors: RunError if the file is not there, or is no whole checkpoint of this program.
+    """
+    import torch
+
+    if not path.is_file():
+        what = "no finished epoch" if (path.parents[1] / CONFIG).is_file() else "no run"
+        raise RunError(f"{path.parents[1]} holds no {BEST}: it is {what}")
+    try:
+        saved = torch.load(path, weights_only=True, map_location="cpu", mmap=True)
+        if not {"config", "in_features", "num_classes"} <= saved["hyper_parameters"].keys():
+            raise KeyError("its hyper-parameters")
+    except Exception as error:  # whatever a damaged file makes torch say
+        reason = (str(error).splitlines() or [repr(error)])[0][:100]
+        raise RunError(f"{path} is damaged ({reason})") from error
+    return saved
+
+
+def stored_config(folder: Path) -> dict[str, Any]:
+    """The whole config of a run, in plain containers. Errors: RunError if it is not one."""
+    try:
+        return OmegaConf.to_container(checked(_load(folder)))
+    except ConfigError as error:
+        raise RunError(f"{folder / CONFIG} is no config of a run ({error})") from error
 
 
 def _load(folder: Path) -> DictConfig:

@@ -1,55 +1,84 @@
-"""What a finished run shows: a table of its figures, a curve, a picture."""
+"""What a test shows: a table of its figures, curves, pictures."""
 
 from __future__ import annotations
 
+import logging
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
+from tqdm import tqdm
 
-from src.correspondence import Correspondence
 from src.data.datamodule import CorrespondenceData
-from src.figures import curve_figure, render_row, template_colors
+from src.evaluation import Outcome
+from src.figures import (
+    curve_figure,
+    encoded,
+    error_colors,
+    picture_figure,
+    template_colors,
+)
 from src.metrics import THRESHOLDS
+from src.render import RenderError, Row, render
+from src.runs import write_whole
+
+log = logging.getLogger("src.summary")
 
 
-def table(folder: Path, data: CorrespondenceData, metrics: dict[str, float]) -> str:
-    """The test figures of metrics.json, and where to look further."""
-    names = data.shapes.names["test"]
-    vertices = sum(len(item["labels"]) for item in data.datasets["test"].items)
+def table(outcome: Outcome, metrics: Mapping[str, float]) -> list[str]:
+    """The test figures of metrics.json, in lines."""
+    names = outcome.names
     shares = {"exact match": "exact_match"}
     shares |= {f"within {r} sqrt(area)": f"within_{r}" for r in ("0.01", "0.05", "0.10")}
     errors = {"mean geodesic error / sqrt(area)": "geodesic_error",
               "mean geodesic error / diameter": "geodesic_error_diameter"}  # fmt: skip
-    return "\n".join([
-        f"Test on {len(names)} unseen meshes ({names[0]} .. {names[-1]}), {vertices:,} vertices",
+    return [
+        f"Test on {len(names)} unseen meshes ({names[0]} .. {names[-1]}), "
+        f"{len(outcome.labels):,} vertices",
         *(f"  {what:<34} {100 * metrics['test/' + key]:7.2f} %" for what, key in shares.items()),
         *(f"  {what:<34} {metrics['test/' + key]:9.4f}" for what, key in errors.items()),
-        f"Seconds:     {metrics['seconds/preprocess']:.1f} preprocessing, "
-        f"{metrics['seconds/train']:.1f} training",
-        f"Run folder:  {folder}",
-        f"TensorBoard: tensorboard --logdir {folder}",
-    ])  # fmt: skip
+    ]
 
 
-def draw_curve(path: Path, module: Correspondence) -> None:
-    """The curve of correct matches, of validation and test."""
-    curves = {split: (THRESHOLDS, curve) for split, curve in module.curves.items()}
-    curve_figure(curves).savefig(path, dpi=150)
+def draw(
+    folder: Path,
+    curves: Mapping[str, np.ndarray],
+    outcome: Outcome,
+    data: CorrespondenceData,
+    chosen: list[str],
+    kinds: tuple[str, ...] = ("png",),
+) -> None:
+    """Write curve.<kind> and, for the chosen test shapes, correspondence.png and errors.png.
 
-
-def draw_shapes(path: Path, data: CorrespondenceData, predictions: dict[int, np.ndarray]) -> None:
-    """The template and up to four test shapes, each vertex in the colour of its counterpart.
-
-    predictions: by number of the test mesh, int64 [V]. Errors: RenderError.
+    curves: by name, over THRESHOLDS. Without an OpenGL library a warning takes the renders' place.
     """
-    names, template = data.shapes.names["test"], data.shapes.template
+    figure = curve_figure({name: (THRESHOLDS, curve) for name, curve in curves.items()})
+    for kind in kinds:
+        write_whole(folder / f"curve.{kind}", encoded(figure, kind))
+    if not chosen:
+        return
+    rows = [correspondence_row(outcome, data, chosen), error_row(outcome, data, chosen)]
+    try:
+        with tqdm(total=1, desc="Pictures", leave=False, delay=1.0):
+            drawn = render(rows, data.shapes.up)
+    except RenderError as error:
+        log.warning("no pictures of the shapes: %s", error)
+        return
+    figures = {"correspondence.png": picture_figure(*drawn[0], ["template", *chosen]),
+               "errors.png": picture_figure(*drawn[1], chosen, error_bar=True)}  # fmt: skip
+    for name, picture in figures.items():
+        write_whole(folder / name, encoded(picture, "png"))
+
+
+def correspondence_row(outcome: Outcome, data: CorrespondenceData, chosen: list[str]) -> Row:
+    """The template and test shapes, each vertex in the colour of its counterpart."""
+    template = data.shapes.template
     colors = template_colors(template)
-    there = sorted(predictions)  # not all, where several devices shared the test
-    chosen = [there[i] for i in np.unique(np.linspace(0, len(there) - 1, 4).round().astype(int))]
-    render_row(
-        path,
-        [template, *(data.shape(names[i]).mesh for i in chosen)],
-        [colors, *(colors[predictions[i]] for i in chosen)],
-        ["template", *(names[i] for i in chosen)],
-        data.shapes.up,
-    )
+    meshes = [template, *(data.shape(name).mesh for name in chosen)]
+    return Row(meshes, [colors, *(colors[outcome.predicted[outcome.mesh(n)]] for n in chosen)])
+
+
+def error_row(outcome: Outcome, data: CorrespondenceData, chosen: list[str]) -> Row:
+    """Test shapes, each vertex in the colour of its geodesic error."""
+    meshes = [data.shape(name).mesh for name in chosen]
+    return Row(meshes, [error_colors(outcome.errors[outcome.mesh(name)]) for name in chosen])

@@ -5,15 +5,22 @@ from __future__ import annotations
 import logging
 import shlex
 import time
-from functools import partial
 from pathlib import Path
 
 from omegaconf import DictConfig, OmegaConf
-from tqdm import tqdm
 
 from src.cli import entry_point
 from src.config import checked, flat
-from src.runs import BEST, LAST, RunError, Stopped, claim, continued, write_metrics
+from src.runs import (
+    BEST,
+    LAST,
+    RunError,
+    Stopped,
+    claim,
+    continued,
+    read_checkpoint,
+    write_metrics,
+)
 
 log = logging.getLogger("src.train")
 
@@ -47,7 +54,7 @@ def train(config: DictConfig, folder: Path) -> dict[str, float]:
     from src.callbacks import Speed
     from src.correspondence import Correspondence
     from src.data.sources import open_data
-    from src.figures import RenderError
+    from src.evaluation import ERRORS, Outcome, evenly
     from src.trainer import build_trainer
 
     log.info("run folder: %s", folder)
@@ -84,33 +91,26 @@ def train(config: DictConfig, folder: Path) -> dict[str, float]:
     if trainer.is_global_zero:
         trainer.logger.log_hyperparams(flat(plain), tested)
         trainer.logger.finalize("success")
+        outcome = Outcome.of(data.shapes.names["test"], data.datasets["test"].items,
+                             module.results["test"], data.reference.diameter)  # fmt: skip
+        outcome.save(folder / ERRORS)
         write_metrics(folder, metrics)
-        pictures = {"curve.png": partial(summary.draw_curve, module=module)}
-        if config.picture:
-            pictures["correspondence.png"] = partial(
-                summary.draw_shapes, data=data, predictions=module.predictions
-            )
-        for name, draw in tqdm(pictures.items(), desc="Pictures", leave=False, delay=1.0):
-            try:
-                draw(folder / name)
-            except RenderError as error:
-                log.warning("no %s: %s", name, error)
-        log.info(summary.table(folder, data, metrics))
+        chosen = evenly(outcome.names, 4) if config.picture else []
+        summary.draw(folder, module.curves, outcome, data, chosen)
+        for line in summary.table(outcome, metrics):
+            log.info(line)
+        log.info("Seconds:     %.1f preprocessing, %.1f training", seconds, trained)
+        log.info("Run folder:  %s", folder)
+        log.info("TensorBoard: tensorboard --logdir %s", folder)
     return metrics
 
 
 def check(checkpoint: Path, config: dict) -> None:
     """Errors: RunError if a checkpoint can't be read, or is of another network."""
-    import torch
-
     try:
-        saved = torch.load(checkpoint, weights_only=True, map_location="cpu", mmap=True)
-        theirs = saved["hyper_parameters"]["config"]
-    except Exception as error:  # whatever a damaged file makes torch say
-        reason = str(error).splitlines()[0][:100]
-        raise RunError(
-            f"{checkpoint} is damaged ({reason}); without last.ckpt a run begins anew"
-        ) from error
+        theirs = read_checkpoint(checkpoint)["hyper_parameters"]["config"]
+    except RunError as error:
+        raise RunError(f"{error}; without last.ckpt a run begins anew") from error
     for key in ("model", "seq_len"):
         if theirs[key] != config[key]:
             raise RunError(f"{checkpoint} is of another run: its {key} is {theirs[key]}")

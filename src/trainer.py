@@ -15,7 +15,7 @@ from lightning.pytorch.loggers import TensorBoardLogger
 from lightning.pytorch.utilities.exceptions import MisconfigurationException
 from omegaconf import DictConfig
 
-from src.callbacks import Bar, Checkpoint, OrderlyStop, WholeFiles
+from src.callbacks import Bar, Checkpoint, Looks, OrderlyStop, WholeFiles
 from src.config import ConfigError
 
 
@@ -51,6 +51,7 @@ def build_trainer(config: DictConfig, folder: Path, *callbacks: Callback) -> L.T
             plugins=[WholeFiles()],
             callbacks=[
                 Bar(),
+                Looks(),
                 OrderlyStop(folder),
                 LearningRateMonitor("step"),
                 Checkpoint(filename="best", monitor="val/geodesic_error", **keep),
@@ -76,6 +77,15 @@ def keep_freed_memory() -> None:
         mallopt = ctypes.CDLL("libc.so.6").mallopt
         mallopt(-4, 0)  # M_MMAP_MAX: large blocks come from the heap as well
         mallopt(-1, 2**31 - 1)  # M_TRIM_THRESHOLD: and the heap does not shrink
+
+
+def device_of(accelerator: str) -> str:
+    """What torch calls it. Errors: ConfigError if it is not there."""
+    if accelerator not in ("cpu", "gpu"):
+        raise ConfigError(f"accelerator must be one of cpu, gpu; got {accelerator}")
+    if accelerator == "gpu" and not torch.cuda.is_available():
+        raise ConfigError("accelerator=gpu: torch finds no GPU here")
+    return "cuda" if accelerator == "gpu" else "cpu"
 
 
 def choose_precision(wanted: str, accelerator: str) -> str:

@@ -25,4 +25,5 @@ def test_the_notebook_shows_a_run(toy_overrides, tmp_path, monkeypatch):
     outputs = [output for cell in notebook.cells for output in cell.get("outputs", [])]
     assert any(f"{metrics['parameters']:,}" in output.get("text", "") for output in outputs)
     images = [output for output in outputs if "image/png" in output.get("data", {})]
-    assert len(images) == 2  # the curve and the shapes
+    assert len(images) == 3  # the curve, correspondences, errors
+    assert any("are predicted alike" in output.get("text", "") for output in outputs)

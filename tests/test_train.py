@@ -10,6 +10,7 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from types import SimpleNamespace
 
 import lightning as L
 import numpy as np
@@ -19,7 +20,7 @@ from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 
 from src import train as program
-from src.callbacks import Checkpoint, Speed, WholeFiles
+from src.callbacks import Checkpoint, Looks, Speed, WholeFiles
 from src.cli import CONF, run_folder
 from src.config import checked
 from src.correspondence import Correspondence
@@ -102,7 +103,25 @@ def test_what_is_logged_can_be_seen_in_tensorboard(whole_run):
         "lr-Adam", "train/steps_per_second", "test/exact_match",
     }  # fmt: skip
     assert len(events.Scalars("val/loss")) == 4  # every epoch
-    assert len(events.Images("val/curve")) == 4
+    assert events.Images("val/curve") and events.Images("val/shape") and events.Images("test/curve")
+
+
+def test_pictures_in_tensorboard_take_one_per_cent_of_the_time_at_most():
+    """But for the last: there are new ones only once those before have become cheap."""
+    looks, drawn = Looks(), []
+    looks._curve = lambda *arguments: (drawn.append(1), time.sleep(0.05))
+    trainer = SimpleNamespace(training=True, is_global_zero=False)
+    looks.on_train_start(trainer, None)
+    looks.on_validation_end(trainer, None)
+    looks.on_validation_end(trainer, None)
+    assert len(drawn) == 1
+    looks._began -= 6  # as if six seconds had gone by
+    looks.on_validation_end(trainer, None)
+    assert len(drawn) == 2
+    trainer.training = False  # a validation on its own
+    looks._began -= 600
+    looks.on_validation_end(trainer, None)
+    assert len(drawn) == 2
 
 
 def test_a_checkpoint_is_all_that_evaluation_needs(whole_run):
@@ -415,9 +434,10 @@ def test_the_picture_is_drawn_without_a_display(toy_overrides, tmp_path, monkeyp
     run(tmp_path, [*toy_overrides, "optim.epochs=1", "picture=true"])
     import matplotlib.image
 
-    picture = matplotlib.image.imread(tmp_path / "correspondence.png")[..., :3]
-    assert (picture < 0.95).any(axis=2).mean() > 0.05  # something stands on the white ground
-    assert picture.std(axis=(0, 1)).min() > 0.02
+    for name in ("correspondence.png", "errors.png"):
+        picture = matplotlib.image.imread(tmp_path / name)[..., :3]
+        assert (picture < 0.95).any(axis=2).mean() > 0.05  # something stands on the white ground
+        assert picture.std(axis=(0, 1)).min() > 0.02
 
 
 def die(*arguments):
@@ -427,9 +447,11 @@ def die(*arguments):
 def test_without_opengl_there_is_no_picture_and_one_line_says_so(
     toy_overrides, tmp_path, monkeypatch, caplog
 ):
-    monkeypatch.setattr("src.figures._render_row", die)
+    monkeypatch.setattr("src.render._render", die)
     run(tmp_path, [*toy_overrides, "optim.epochs=1", "picture=true"])
-    assert "no correspondence.png: VTK could not draw; it needs an OpenGL library" in caplog.text
+    assert (
+        "no pictures of the shapes: VTK could not draw; it needs an OpenGL library" in caplog.text
+    )
     assert (tmp_path / METRICS).is_file()
 
 

@@ -51,12 +51,26 @@ def draw_spirals(
     return sequences.index_select(0, first[:-1] + step).long()
 
 
+def rotate(batch: Batch, *purpose: int | str) -> Batch:
+    """The batch with one spiral of every vertex in the place of the spiral table, drawn from
+    (purpose, mesh) alone. A batch with patches is served as it is."""
+    if "sequences" not in batch:
+        return batch
+    batch = dict(batch)
+    sequences, first = batch.pop("sequences"), batch.pop("first")
+    generator = torch.Generator(first.device)
+    generator.manual_seed(derived_seed(*purpose, batch["index"]))
+    batch["spirals"] = draw_spirals(sequences, first, generator)
+    return batch
+
+
 class MeshDataset(Dataset):
     """The tensors of one split. Item i is a dictionary, without a batch dimension:
 
     features float32 [V, C]; labels int64 [V]; vertices float32 [V, 3]; unit float32 [], the length
-    that metric information is divided by; index int, i; and the neighbourhoods: either sequences
-    int32 [R, N] and first int64 [V+1], the spiral table, or patches, see `by_rows_and_columns`.
+    that metric information is divided by; index int, i; the neighbourhoods: either sequences
+    int32 [R, N] and first int64 [V+1], the spiral table, or patches, see `by_rows_and_columns`;
+    and corners int64 [V, 3] and weights float64 [V, 3] where the truth is a point of a face.
     """
 
     def __init__(self, names: list[str], items: list[Batch]):
@@ -127,6 +141,11 @@ class CorrespondenceData(L.LightningDataModule):
         return len(self.shapes.template.vertices)
 
     @property
+    def template_key(self) -> str:
+        """The same for two data sets whose labels mean the same."""
+        return digest(self.shapes.template.vertices, self.shapes.template.faces)
+
+    @property
     def in_features(self) -> int:
         return 32 * (self.recipe.shot_bins + 1)
 
@@ -142,7 +161,7 @@ class CorrespondenceData(L.LightningDataModule):
             return shape
         rng = np.random.default_rng(derived_seed(self.seed, "shuffle", name))
         order = rng.permutation(len(shape.labels))
-        return Shape(shape.mesh.renumbered(order), shape.labels[order], shape.template_size)
+        return shape.renumbered(order)
 
     def setup(self, stage: str | None = None) -> None:
         splits = {"fit": ("train", "val"), "validate": ("val",), "test": ("test",)}
@@ -175,6 +194,8 @@ class CorrespondenceData(L.LightningDataModule):
                 log.warning("%s: no descriptor at %d of %d vertices; zeros stand there",
                             name, undefined, len(shape.labels))  # fmt: skip
             item["labels"] = torch.from_numpy(shape.labels)
+            if shape.points is not None:
+                item |= _tensors(shape.points._asdict())
             item["vertices"] = torch.from_numpy(shape.mesh.vertices.astype(np.float32))
             item["unit"] = torch.tensor(
                 self.recipe.shot_radius * np.sqrt(shape.mesh.area), dtype=torch.float32
@@ -214,16 +235,9 @@ class CorrespondenceData(L.LightningDataModule):
         return (trainer.global_rank, trainer.world_size) if trainer is not None else (0, 1)
 
     def on_after_batch_transfer(self, batch: Batch, dataloader_idx: int) -> Batch:
-        if "sequences" not in batch:
-            return batch
-        batch = dict(batch)
         trainer = self.trainer
         when = f"epoch {trainer.current_epoch}" if trainer.training else "evaluation"
-        sequences, first = batch.pop("sequences"), batch.pop("first")
-        generator = torch.Generator(first.device)
-        generator.manual_seed(derived_seed(self.seed, "spirals", when, batch["index"]))
-        batch["spirals"] = draw_spirals(sequences, first, generator)
-        return batch
+        return rotate(batch, self.seed, "spirals", when)
 
     def state_dict(self) -> dict[str, int]:
         progress = self.trainer.fit_loop.epoch_loop.batch_progress.current

@@ -22,7 +22,8 @@ class ReferenceDistances:
 
     Rows are computed in blocks of neighbouring vertex numbers and kept on disk and in memory.
     diameter: the template's geodesic diameter, over sqrt(area) too, so that an error over the
-    diameter is an error over sqrt(area) divided by it. Between two components of the template
+    diameter is an error over sqrt(area) divided by it. place: float64 [K, 3], the template's
+    vertices over sqrt(area). Between two components of the template
     there is no path; such a distance counts as the diameter.
     """
 
@@ -33,6 +34,7 @@ class ReferenceDistances:
         versions = code_version(geodesics, mesh, sys.modules[__name__]), version("potpourri3d")
         self._key = digest(template.vertices, template.faces, *versions)
         self._unit = np.sqrt(template.area)
+        self.place = template.vertices / self._unit
         kept = store.get("diameter", self._key, self._compute_diameter)
         self.diameter = float(kept["diameter"])
 

@@ -6,6 +6,7 @@ import zipfile
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -18,30 +19,58 @@ class DataError(ValueError):
     """A data set that is missing or wrong; the message says what, where, and what would mend it."""
 
 
+class SurfacePoints(NamedTuple):
+    """Points on the template: corners int64 [V, 3], the vertices of a face, and weights float64
+    [V, 3], the barycentric coordinates in it."""
+
+    corners: np.ndarray
+    weights: np.ndarray
+
+
 @dataclass(frozen=True, eq=False)
 class Shape:
     """One mesh with its ground truth.
 
     labels: int64 [V], for every vertex its counterpart, a vertex of the data set's template.
-    DataError is raised for a wrong count or a label outside the template.
+    points: where on the template the counterpart lies exactly, if it lies within a face; the label
+    is then the nearest vertex. DataError is raised for a wrong count or a label outside the
+    template.
     """
 
     mesh: Mesh
     labels: np.ndarray
     template_size: int
+    points: SurfacePoints | None = None
 
     def __post_init__(self) -> None:
         labels = np.ascontiguousarray(self.labels, dtype=np.int64)
         vertices = len(self.mesh.vertices)
         if labels.shape != (vertices,):
             raise DataError(f"{self.mesh.name}: {vertices} vertices but labels {labels.shape}")
-        bad = np.flatnonzero((labels < 0) | (labels >= self.template_size))
+        self._within(labels, "labels")
+        object.__setattr__(self, "labels", labels)
+        if self.points is not None:
+            corners = np.ascontiguousarray(self.points.corners, dtype=np.int64)
+            weights = np.ascontiguousarray(self.points.weights, dtype=np.float64)
+            if corners.shape != (vertices, 3) or weights.shape != (vertices, 3):
+                raise DataError(f"{self.mesh.name}: {vertices} vertices but points on the template "
+                                f"{corners.shape}, {weights.shape}")  # fmt: skip
+            self._within(corners.min(axis=1), "points")
+            self._within(corners.max(axis=1), "points")
+            object.__setattr__(self, "points", SurfacePoints(corners, weights))
+
+    def _within(self, vertices: np.ndarray, what: str) -> None:
+        bad = np.flatnonzero((vertices < 0) | (vertices >= self.template_size))
         if len(bad):
             raise DataError(
-                f"{self.mesh.name}: {len(bad)} labels outside 0..{self.template_size - 1}, "
-                f"the template's vertices; first: vertex {bad[0]} has {labels[bad[0]]}"
+                f"{self.mesh.name}: {len(bad)} {what} outside 0..{self.template_size - 1}, "
+                f"the template's vertices; first: vertex {bad[0]} has {vertices[bad[0]]}"
             )
-        object.__setattr__(self, "labels", labels)
+
+    def renumbered(self, order: np.ndarray) -> Shape:
+        """The same shape with vertex order[i] at place i."""
+        points = self.points and SurfacePoints(*(array[order] for array in self.points))
+        return Shape(self.mesh.renumbered(order), self.labels[order], self.template_size, points)
 
 
 class ShapeSet(ABC):

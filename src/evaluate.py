@@ -1,0 +1,218 @@
+"""Test a finished run again, and draw it: `python -m src.evaluate run=<run folder>`."""
+
+from __future__ import annotations
+
+import json
+import logging
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from omegaconf import DictConfig, OmegaConf
+from tqdm import tqdm
+
+from src.cli import entry_point
+from src.config import ConfigError, checked, typed
+from src.data.shapes import DataError
+from src.data.store import digest
+from src.runs import BEST, METRICS, RunError, read_checkpoint, write_whole
+
+KINDS = ("png", "pdf", "svg")  # of a figure
+
+log = logging.getLogger("src.evaluate")
+
+
+@dataclass
+class Evaluate:
+    run: str | None = None
+    data: Any = None
+    rotations: int = 0
+    shapes: Any = 4
+    accelerator: str = "cpu"
+    threads: int | None = None
+
+
+def check(config: DictConfig) -> DictConfig:
+    plain = OmegaConf.to_container(config, resolve=True)
+    data = plain.pop("data", None)
+    found = typed(OmegaConf.create(plain), Evaluate)
+    found.data = data
+    if not found.run:
+        raise ConfigError(
+            "run= is missing: the folder of a run, such as outputs/2026-01-31/..._fcs"
+        )
+    if found.rotations < 0 or found.rotations == 1:
+        raise ConfigError(f"rotations must be 0 or at least 2, to compare; got {found.rotations}")
+    if found.threads is not None and found.threads < 1:
+        raise ConfigError(f"threads must be at least 1; got {found.threads}")
+    shapes = (
+        OmegaConf.to_container(found.shapes) if OmegaConf.is_list(found.shapes) else found.shapes
+    )
+    count = isinstance(shapes, int) and not isinstance(shapes, bool) and shapes >= 0
+    names = isinstance(shapes, list) and all(isinstance(name, str) for name in shapes)
+    if not (count or names):
+        raise ConfigError(
+            f"shapes must be a number of test shapes, or a list of names; got {shapes}"
+        )
+    return found
+
+
+@entry_point("evaluate", check)
+def main(config: DictConfig) -> None:
+    folder = evaluate(config)
+    log.info("Written to:  %s", folder)
+
+
+def evaluate(config: DictConfig) -> Path:
+    """Test, write and draw. Returns the folder of what it wrote, within that of the run."""
+    import torch
+
+    from src import summary
+    from src.evaluation import ERRORS, Outcome, json_ready, rotations
+    from src.figures import all_curves_figure, encoded
+    from src.metrics import THRESHOLDS
+
+    if config.threads:
+        torch.set_num_threads(config.threads)
+    torch.set_flush_denormal(True)
+    run = Path(config.run)
+    if not run.is_dir():
+        raise RunError(f"run={run}: is not a folder")
+    saved = read_checkpoint(run / BEST)
+    trained = saved["hyper_parameters"]["config"]
+    settings = merged(trained, config)
+    if config.rotations and "patch" in settings.model:
+        raise ConfigError(f"rotations= is for networks on spirals; {settings.model.name} has none")
+    predict = predictor(saved, OmegaConf.to_container(settings), config.accelerator)
+    data = opened(settings, saved, config.data)
+
+    items, names = data.datasets["test"].items, data.shapes.names["test"]
+    chosen = selected(config.shapes, names)
+    progress = tqdm(range(len(items)), desc="Test", unit="mesh", leave=False, delay=1.0)
+    results = {i: predict(data, i, "evaluation") for i in progress}
+    outcome = Outcome.of(names, items, results, data.reference.diameter)
+    figures, curve = outcome.figures()
+    metrics = json_ready(figures, "test")
+
+    folder = run / "evaluation" / place(settings.data, trained["data"], config.data)
+    folder.mkdir(parents=True, exist_ok=True)
+    outcome.save(folder / ERRORS)
+    for line in summary.table(outcome, metrics):
+        log.info(line)
+    if config.rotations:
+        progress = tqdm(range(config.rotations), desc="Rotations", unit="run")
+        runs = ([predict(data, i, f"rotation {r}") for i in range(len(items))] for r in progress)
+        found = rotations(runs, [item["labels"].numpy() for item in items])
+        metrics |= json_ready(found.figures(), "rotations")
+        figure = all_curves_figure(THRESHOLDS, found.curves)
+        for kind in KINDS:
+            write_whole(folder / f"rotations.{kind}", encoded(figure, kind))
+        for line in told(found):
+            log.info(line)
+    write_whole(folder / METRICS, json.dumps(metrics, indent=2) + "\n")
+    summary.draw(folder, {"test": curve}, outcome, data, chosen, KINDS)
+    return folder
+
+
+def merged(trained: dict[str, Any], config: DictConfig) -> DictConfig:
+    """The config of the run, with the data set that is asked for instead of its own."""
+    given = {key: value for key, value in (config.data or {}).items() if value is not None}
+    kept = ("shot", "shuffle_vertices", "cache_dir", "workers")
+    if "name" in given:
+        given = {key: trained["data"][key] for key in kept} | given
+    else:
+        given = trained["data"] | given
+    return checked(OmegaConf.create(trained | {"data": given}))
+
+
+def place(data: DictConfig, trained: dict[str, Any], asked: DictConfig | None) -> str:
+    """The name of a folder for that data set; another for another one of the same name."""
+    what = {k: v for k, v in data.items() if k not in ("cache_dir", "workers")}
+    if not (asked and asked.get("name")) or all(trained.get(k) == v for k, v in what.items()):
+        return data.name
+    return f"{data.name}-{digest(json.dumps(what, default=list))[:8]}"
+
+
+def opened(settings: DictConfig, saved: dict[str, Any], asked: DictConfig | None):
+    """The data with its test shapes ready. Errors: RunError if its labels mean another template."""
+    from src.data.sources import open_data
+
+    try:
+        data = open_data(OmegaConf.to_container(settings))
+    except DataError as error:
+        if asked and asked.get("name"):
+            raise
+        raise DataError(f"{error}; if the data set has moved: data.root=") from error
+    if saved.get("template") != data.template_key:
+        raise RunError(
+            f"the labels of {settings.data.name} mean the {data.num_classes} vertices of another "
+            f"template than the {saved['hyper_parameters']['num_classes']} this run was trained on"
+        )
+    data.prepare(["test"])
+    return data
+
+
+def predictor(saved: dict[str, Any], settings: dict[str, Any], accelerator: str):
+    """A trained network: predict(data, i, purpose) tests mesh i of the data's test set, with
+    spirals drawn for that purpose.
+
+    saved: of `read_checkpoint`. settings: its whole config, in plain containers.
+    """
+    import torch
+
+    from src.correspondence import Correspondence
+    from src.data.datamodule import rotate
+    from src.evaluation import result_of
+    from src.trainer import choose_precision, device_of
+
+    device = device_of(accelerator)
+    precision = choose_precision(settings["trainer"]["precision"], accelerator)
+    sizes = (saved["hyper_parameters"][key] for key in ("in_features", "num_classes"))
+    module = Correspondence(settings, *sizes)
+    try:
+        module.load_state_dict(saved["state_dict"])
+    except RuntimeError as error:
+        raise RunError("the checkpoint's weights are not those of its config") from error
+    module.to(device, torch.float64 if precision == "64-true" else torch.float32).eval()
+
+    def predict(data, i: int, purpose: str):
+        batch = rotate(data.datasets["test"][i], settings["seed"], "spirals", purpose)
+        batch = module.transfer_batch_to_device(batch, torch.device(device), 0)
+        if precision == "64-true":
+            batch = {key: value.double() if key in ("features", "vertices", "unit") else value
+                     for key, value in batch.items()}  # fmt: skip
+        with torch.inference_mode(), torch.autocast(device, torch.bfloat16,
+                                                    enabled=precision == "bf16-mixed"):  # fmt: skip
+            predicted, _ = module.predict(batch)
+        return result_of(predicted, batch, data.reference)
+
+    return predict
+
+
+def selected(shapes: int | list[str], names: list[str]) -> list[str]:
+    """The test shapes to draw. Errors: ConfigError for one that is not there."""
+    from src.evaluation import evenly
+
+    if isinstance(shapes, int):
+        return evenly(names, shapes) if shapes else []
+    for name in shapes:
+        if name not in names:
+            raise ConfigError(f"shapes: {name} is no test shape; there are: {', '.join(names)}")
+    return list(shapes)
+
+
+def told(found) -> list[str]:
+    """The figures of other rotations, in lines."""
+    exact, error = 100 * found.exact_match, found.geodesic_error
+    return [
+        f"With {len(exact)} other spirals for every vertex",
+        f"  exact match           {exact.mean():.2f} % (spread {exact.std():.2f}, "
+        f"{exact.min():.2f} to {exact.max():.2f})",
+        f"  mean geodesic error   {error.mean():.4f} (spread {error.std():.4f}, "
+        f"{error.min():.4f} to {error.max():.4f})",
+        f"  predicted alike in all {100 * found.unchanged:.2f} % of the vertices",
+    ]
+
+
+if __name__ == "__main__":
+    main()

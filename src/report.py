@@ -1,0 +1,104 @@
+"""One page of many runs, to look through and print from: `python -m src.report runs=<folder>`."""
+
+from __future__ import annotations
+
+import logging
+import os
+import re
+from dataclasses import dataclass
+from pathlib import Path
+
+from omegaconf import DictConfig
+from tqdm import tqdm
+
+from src.cli import entry_point
+from src.config import ConfigError, typed
+from src.data.shapes import DataError
+from src.geometry.mesh import MeshError
+from src.runs import write_whole
+
+log = logging.getLogger("src.report")
+
+
+@dataclass
+class Report:
+    runs: str | None = None
+    output: str | None = None
+    shapes: int = 4
+
+
+def check(config: DictConfig) -> DictConfig:
+    found = typed(config, Report)
+    if not found.runs:
+        raise ConfigError("runs= is missing: a folder with runs, or a pattern: 'outputs/*/*_fcs'")
+    if found.shapes < 0:
+        raise ConfigError(f"shapes must be at least 0; got {found.shapes}")
+    return found
+
+
+@entry_point("report", check)
+def main(config: DictConfig) -> None:
+    folder = report(config)
+    log.info("Report:  %s", folder / "index.html")
+
+
+def report(config: DictConfig) -> Path:
+    """Write the page, its figures and tables. Returns their folder."""
+    from src.comparison import arrangements, as_csv, as_tex, collect, grouped, run_table
+    from src.figures import curve_figure, encoded
+    from src.metrics import THRESHOLDS
+    from src.page import page
+
+    runs, broken = collect(config.runs)
+    for _, reason in broken:
+        log.warning("left out: %s", reason)
+    groups = grouped(runs)
+    folder = Path(config.output) if config.output else beside(config.runs) / "report"
+    folder.mkdir(parents=True, exist_ok=True)
+
+    figures = dict(arrangements(groups))
+    drawn = {}
+    for title, curves in tqdm(figures.items(), desc="Curves", leave=False, delay=1.0):
+        figure = curve_figure({name: (THRESHOLDS, several) for name, several in curves.items()})
+        svg = encoded(figure, "svg").decode()
+        drawn[title] = svg[svg.index("<svg") :]
+        name = re.sub(r"[^a-z0-9]+", "-", title.lower()).strip("-")
+        write_whole(folder / f"{name}.pdf", encoded(figure, "pdf"))
+    write_whole(folder / "table.csv", as_csv(*run_table(groups)))
+    write_whole(folder / "table.tex", as_tex(groups))
+    scenes, notes = looks(runs, config.shapes)
+    for note in notes:
+        log.warning("%s", note)
+    write_whole(folder / "index.html", page(groups, broken, drawn, scenes, notes))
+    log.info("%d runs, %d left out", len(runs), len(broken))
+    return folder
+
+
+def beside(runs: str) -> Path:
+    """The folder that a pattern's places lie in, or the folder itself."""
+    parts = Path(runs).parts
+    plain = next((i for i, part in enumerate(parts) if re.search(r"[*?\[]", part)), len(parts))
+    return Path(*parts[:plain])
+
+
+def looks(runs: list, count: int):
+    """The 3D views of so many shapes of each run; and what is missing, in lines."""
+    from src.data.sources import open_data
+    from src.evaluation import evenly
+    from src.page import Scenes
+
+    scenes, notes = Scenes(), []
+    above = Path(os.path.commonpath([run.folder.parent for run in runs]))
+    for run in tqdm(runs if count else [], desc="Shapes", leave=False, delay=1.0):
+        try:
+            data = open_data(run.config)
+            for name in evenly(run.outcome.names, count):
+                mesh = data.shape(name).mesh
+                scenes.add(str(run.folder.relative_to(above)), name, mesh, data, run.outcome)
+        except (DataError, MeshError, OSError) as error:
+            notes.append(f"{run.folder}: no view of its shapes ({error})")
+    return scenes, notes
+
+
+if __name__ == "__main__":
+    main()
