@@ -33,11 +33,12 @@ from src.data.preprocessing import (
 from src.data.sources import open_shapes
 from src.data.store import Store
 from src.figures import growth_figure
+from src.memory import keep_freed_memory
 from src.nn.geodesic import Resampling
 from src.nn.networks import GCNN3, FCSNet, LSTMNet
 from src.plain import PlainNetwork
 from src.runs import write_whole
-from src.trainer import choose_precision, device_of, keep_freed_memory
+from src.trainer import choose_precision, device_of
 
 log = logging.getLogger("src.benchmark")
 

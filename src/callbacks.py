@@ -186,7 +186,7 @@ class Looks(Callback):
 
     def on_validation_end(self, trainer: L.Trainer, module: L.LightningModule) -> None:
         now = time.perf_counter()
-        if not trainer.training or self._spent > self.SHARE * (now - self._began):
+        if trainer.state.fn != "fit" or self._spent > self.SHARE * (now - self._began):
             return
         self._curve(trainer, module, "val")
         if trainer.is_global_zero and trainer.logger is not None:

@@ -8,10 +8,10 @@ from tqdm import tqdm
 
 from src import measure
 from src.data.preprocessing import by_rows_and_columns
+from src.memory import keep_freed_memory
 from src.nn.geodesic import Resampling
 from src.nn.loss import linear_cross_entropy
 from src.nn.networks import GCNN3, FCSNet, LSTMNet
-from src.trainer import keep_freed_memory
 
 VERTICES, TEMPLATE, LENGTH = 6890, 1500, 20  # what does not grow
 SIZES = [1500, 3000, 6000, 12_000, 25_000, 50_000, 100_000]

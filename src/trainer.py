@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
-import ctypes
 import logging
 import warnings
 from pathlib import Path
@@ -17,6 +15,7 @@ from omegaconf import DictConfig
 
 from src.callbacks import Bar, Checkpoint, Looks, OrderlyStop, WholeFiles
 from src.config import ConfigError
+from src.memory import keep_freed_memory
 
 
 def build_trainer(config: DictConfig, folder: Path, *callbacks: Callback) -> L.Trainer:
@@ -65,18 +64,6 @@ def build_trainer(config: DictConfig, folder: Path, *callbacks: Callback) -> L.T
             f"trainer: accelerator {asked.accelerator}, devices {asked.devices}, strategy "
             f"{asked.strategy}, precision {asked.precision} can't be had here ({reason})"
         ) from error
-
-
-def keep_freed_memory() -> None:
-    """Have the C library keep the memory of large tensors for the next ones of this process.
-
-    It would give each back to the system, and every page of the next be cleared and mapped again,
-    which takes a tenth of a step of LSTM-NET. Where the library is not GNU's, all stays as it is.
-    """
-    with contextlib.suppress(OSError, AttributeError):
-        mallopt = ctypes.CDLL("libc.so.6").mallopt
-        mallopt(-4, 0)  # M_MMAP_MAX: large blocks come from the heap as well
-        mallopt(-1, 2**31 - 1)  # M_TRIM_THRESHOLD: and the heap does not shrink
 
 
 def device_of(accelerator: str) -> str:

@@ -52,8 +52,8 @@ def draw_spirals(
 
 
 def rotate(batch: Batch, *purpose: int | str) -> Batch:
-    """The batch with one spiral of every vertex in the place of the spiral table, drawn from
-    (purpose, mesh) alone. A batch with patches is served as it is."""
+    """The batch with one spiral of every vertex in the place of the spiral table, if it has one,
+    drawn from (purpose, mesh) alone."""
     if "sequences" not in batch:
         return batch
     batch = dict(batch)
@@ -235,6 +235,8 @@ class CorrespondenceData(L.LightningDataModule):
         return (trainer.global_rank, trainer.world_size) if trainer is not None else (0, 1)
 
     def on_after_batch_transfer(self, batch: Batch, dataloader_idx: int) -> Batch:
+        if "sequences" not in batch:
+            return batch
         trainer = self.trainer
         when = f"epoch {trainer.current_epoch}" if trainer.training else "evaluation"
         return rotate(batch, self.seed, "spirals", when)
