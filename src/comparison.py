@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import csv
 import glob
-import io
 import json
+import re
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,11 +13,15 @@ from typing import Any
 import numpy as np
 
 from src.config import flat
+from src.data.store import digest
 from src.evaluation import ERRORS, Outcome
 from src.runs import CONFIG, METRICS, RunError, stored_config
 
-# where and how a run was computed, or what its picture shows: not what was computed
-BESIDE = ("trainer.", "data.cache_dir", "data.workers", "data.root", "picture", "resume", "metric")
+# where a run was computed, or what its picture shows: not what was computed
+BESIDE = ("trainer.accelerator", "trainer.threads", "trainer.strategy", "data.cache_dir",
+          "data.workers", "data.root", "data.benchmark_root", "picture", "resume",
+          "metric")  # fmt: skip
+SHARED = ("shot.", "shuffle_vertices")  # settings of every data set, not what tells them apart
 NETWORKS = {"lstm": "LSTM-NET", "fcs": "FCS-NET", "gcnn3": "GCNN3"}
 FIGURES = {
     "test/exact_match": "exact match (%)",
@@ -56,7 +59,8 @@ class Run:
 def collect(where: str) -> tuple[list[Run], list[tuple[Path, str]]]:
     """The finished runs in a folder, at any depth, or in all folders that a pattern names; and the
     folders of those that are not whole, with the reason. Errors: RunError if there are none."""
-    places = [Path(place) for place in sorted(glob.glob(where, recursive=True))]
+    places = [Path(where)] if Path(where).is_dir() else map(Path, glob.glob(where, recursive=True))
+    places = sorted(places)
     if not places:
         raise RunError(f"runs={where}: there is no such folder")
     folders = sorted({path.parent for place in places for path in place.rglob(CONFIG)})
@@ -105,6 +109,10 @@ class Group:
     runs: list[Run]
 
     @property
+    def seeds(self) -> set[int]:
+        return {run.config["seed"] for run in self.runs}
+
+    @property
     def curves(self) -> np.ndarray:
         """float [R, T], one for each seed."""
         return np.stack([run.curve for run in self.runs])
@@ -126,39 +134,46 @@ class Group:
 
 
 def grouped(runs: list[Run]) -> list[Group]:
-    """The groups, in the order of their first runs."""
+    """The groups, by network, length and metric information."""
     others, groups = varied(runs), {}
-    several = len({json.dumps(data_settings(run)) for run in runs}) > len(
-        {run.config["data"]["name"] for run in runs}
-    )
-    for run in runs:
+    for run, data in zip(runs, data_names(runs), strict=True):
         model, settings = run.config["model"], run.settings
-        spirals = model["name"] != "gcnn3"
-        length = None
-        if spirals:
-            rings = model.get("rings")
+        rings, length = model.get("rings"), None
+        if "seq_len" in settings:
             length = f"{rings} rings" if rings else f"N = {run.config['seq_len']}"
-        data = run.config["data"]["name"]
-        if several:
-            data += "".join(
-                f" {value}" for key, value in data_settings(run).items() if key != "name"
-            )
         theirs = tuple((key, settings[key]) for key in others if key in settings)
-        group = (
-            NETWORKS.get(model["name"], model["name"]),
-            data,
-            length,
-            model.get("metric"),
-            theirs,
-        )
+        group = (NETWORKS[model["name"]], data, length, model.get("metric"), theirs)
         groups.setdefault(json.dumps(group), (*group, []))[-1].append(run)
-    return [Group(*group) for group in groups.values()]
+
+    def place(group: Group):
+        number = int(re.search(r"\d+", group.length or "0")[0])
+        return group.data, group.network, bool(group.length), number, bool(group.metric)
+
+    return sorted((Group(*group) for group in groups.values()), key=place)
 
 
-def data_settings(run: Run) -> dict[str, Any]:
-    """Which data set, without what is set of every data set."""
-    left_out = ("shot", "shuffle_vertices", "cache_dir", "workers", "root")
-    return {key: value for key, value in run.config["data"].items() if key not in left_out}
+def data_names(runs: list[Run]) -> list[str]:
+    """For each run the name of its data set, with the settings in which sets of that name differ,
+    and a number where their test shapes differ all the same, as those of two folders do."""
+    ways = [{k.removeprefix("data."): v for k, v in run.settings.items() if k.startswith("data.")}
+            for run in runs]  # fmt: skip
+    names: list[str] = []
+    for way in ways:
+        alike = [other for other in ways if other["name"] == way["name"]]
+        differ = [k for k, v in way.items() if any(other.get(k) != v for other in alike)]
+        said = [v if isinstance(v, str | int) else digest(json.dumps(v))[:6]
+                for v in (way[k] for k in differ if not k.startswith(SHARED))]  # fmt: skip
+        names.append(" ".join([way["name"], *map(str, said)]))
+    kinds: dict[str, list[str]] = {}
+    for i, run in enumerate(runs):
+        kept = run.outcome
+        truth = digest(np.array(kept.names), kept.labels, kept.diameter)
+        known = kinds.setdefault(names[i], [])
+        if truth not in known:
+            known.append(truth)
+        if number := known.index(truth):
+            names[i] += f" ({number + 1})"
+    return names
 
 
 def varied(runs: list[Run]) -> list[str]:
@@ -174,8 +189,8 @@ def varied(runs: list[Run]) -> list[str]:
             if len({json.dumps(settings.get(key)) for settings in several}) > 1:
                 found.add(key)
     fields = {"model.name", "model.metric", "model.rings", "seq_len"}
-    fields |= {f"data.{key}" for run in runs for key in data_settings(run)}
-    return sorted(found - fields)
+    of_data = {k for k in found if k.startswith("data.") and not k[5:].startswith(SHARED)}
+    return sorted(found - fields - of_data)
 
 
 def labelled(groups: list[Group], *without: str) -> dict[str, np.ndarray]:
@@ -218,61 +233,6 @@ def arrangements(groups: list[Group]) -> Iterator[tuple[str, dict[str, np.ndarra
         yield title, labelled(here, "network", "length", "data")
 
 
-# ------------------------------------------------------------------------------------- the tables
-
-
-def run_table(groups: list[Group]) -> tuple[list[str], list[list[Any]]]:
-    """Names of columns, and a row for each run."""
-    others = sorted({key for group in groups for key, _ in group.others})
-    columns = ["network", "N", "metric", "data", "seed", *others, *FIGURES.values(), "folder"]
-    rows = []
-    for group in groups:
-        for run in group.runs:
-            rows.append([*described(group), run.config["seed"],
-                         *(dict(group.others).get(key) for key in others),
-                         *(run.figure(key) for key in FIGURES), str(run.folder)])  # fmt: skip
-    return columns, rows
-
-
-def described(group: Group) -> list[Any]:
-    length = group.length and group.length.removeprefix("N = ")
-    return [group.network, length, group.metric, group.data]
-
-
-def as_csv(columns: list[str], rows: list[list[Any]]) -> str:
-    text = io.StringIO()
-    csv.writer(text, lineterminator="\n").writerows([columns, *rows])
-    return text.getvalue()
-
-
-def as_tex(groups: list[Group]) -> str:
-    """A table for booktabs: a row for each group, mean and spread where it has several seeds."""
-    others = sorted({key for group in groups for key, _ in group.others})
-    shown = [key for key in FIGURES if key.startswith("test/") or key == "parameters"]
-    columns = ["network", "$N$", "metric", "data", *map(escaped, others),
-               *(escaped(FIGURES[key]) for key in shown)]  # fmt: skip
-    lines = [rf"\begin{{tabular}}{{{'l' * (4 + len(others))}{'r' * len(shown)}}}", r"\toprule",
-             " & ".join(columns) + r" \\", r"\midrule"]  # fmt: skip
-    for group in groups:
-        cells = [*described(group), *(dict(group.others).get(key) for key in others)]
-        texts = ["--" if cell is None else escaped(plain(cell)) for cell in cells]
-        texts += [
-            spread([run.figure(key) for run in group.runs], key).replace("±", r"$\pm$")
-            for key in shown
-        ]
-        lines.append(" & ".join(texts) + r" \\")
-    return "\n".join([*lines, r"\bottomrule", r"\end{tabular}", ""])
-
-
-def spread(values: list[float], key: str) -> str:
-    """The mean, and the standard deviation of several seeds, as a reader wants them."""
-    if key == "parameters":
-        return f"{values[0]:,.0f}"
-    digits = 1 if "%" in FIGURES[key] else 0 if key.startswith("seconds") else 4
-    several = f" ± {np.std(values):.{digits}f}" if len(values) > 1 else ""
-    return f"{np.mean(values):.{digits}f}{several}"
-
-
 def plain(value: Any) -> str:
     """As a reader wants it."""
     if value is None:
@@ -280,9 +240,3 @@ def plain(value: Any) -> str:
     return (
         {True: "yes", False: "no"}.get(value, str(value)) if isinstance(value, bool) else str(value)
     )
-
-
-def escaped(text: str) -> str:
-    for character in "\\_%&#${}":
-        text = text.replace(character, {"\\": r"\textbackslash "}.get(character, "\\" + character))
-    return text

@@ -18,6 +18,8 @@ from src.data.store import digest
 from src.runs import BEST, METRICS, RunError, read_checkpoint, write_whole
 
 KINDS = ("png", "pdf", "svg")  # of a figure
+OURS = ["errors.png", "correspondence.png",
+        *(f"{figure}.{kind}" for figure in ("curve", "rotations") for kind in KINDS)]  # fmt: skip
 
 log = logging.getLogger("src.evaluate")
 
@@ -80,11 +82,13 @@ def evaluate(config: DictConfig) -> Path:
         raise RunError(f"run={run}: is not a folder")
     saved = read_checkpoint(run / BEST)
     trained = saved["hyper_parameters"]["config"]
-    settings = merged(trained, config)
-    if config.rotations and "patch" in settings.model:
-        raise ConfigError(f"rotations= is for networks on spirals; {settings.model.name} has none")
-    predict = predictor(saved, OmegaConf.to_container(settings), config.accelerator)
-    data = opened(settings, saved, config.data)
+    asked = OmegaConf.to_container(config.data) if config.data else {}
+    settings = OmegaConf.to_container(merged(trained, asked))
+    name = settings["model"]["name"]
+    if config.rotations and "patch" in settings["model"]:
+        raise ConfigError(f"rotations= is for networks on spirals; {name} has none")
+    predict = predictor(saved, settings, config.accelerator)
+    data = opened(settings, saved, asked)
 
     items, names = data.datasets["test"].items, data.shapes.names["test"]
     chosen = selected(config.shapes, names)
@@ -94,8 +98,10 @@ def evaluate(config: DictConfig) -> Path:
     figures, curve = outcome.figures()
     metrics = json_ready(figures, "test")
 
-    folder = run / "evaluation" / place(settings.data, trained["data"], config.data)
+    folder = run / "evaluation" / place(settings["data"], trained["data"], asked)
     folder.mkdir(parents=True, exist_ok=True)
+    for old in OURS:  # of another evaluation, beside the figures of this one
+        (folder / old).unlink(missing_ok=True)
     outcome.save(folder / ERRORS)
     for line in summary.table(outcome, metrics):
         log.info(line)
@@ -114,39 +120,38 @@ def evaluate(config: DictConfig) -> Path:
     return folder
 
 
-def merged(trained: dict[str, Any], config: DictConfig) -> DictConfig:
+def merged(trained: dict[str, Any], asked: dict[str, Any]) -> DictConfig:
     """The config of the run, with the data set that is asked for instead of its own."""
-    given = {key: value for key, value in (config.data or {}).items() if value is not None}
-    kept = ("shot", "shuffle_vertices", "cache_dir", "workers")
-    if "name" in given:
-        given = {key: trained["data"][key] for key in kept} | given
-    else:
-        given = trained["data"] | given
-    return checked(OmegaConf.create(trained | {"data": given}))
+    anywhere = ("root", "cache_dir", "workers")  # null: as in the run
+    given = {key: value for key, value in asked.items() if value is not None or key not in anywhere}
+    of_all = ("shot", "shuffle_vertices", "cache_dir", "workers")
+    kept = {k: v for k, v in trained["data"].items() if "name" not in given or k in of_all}
+    return checked(OmegaConf.create(trained | {"data": OmegaConf.merge(kept, given)}))
 
 
-def place(data: DictConfig, trained: dict[str, Any], asked: DictConfig | None) -> str:
+def place(data: dict[str, Any], trained: dict[str, Any], asked: dict[str, Any]) -> str:
     """The name of a folder for that data set; another for another one of the same name."""
     what = {k: v for k, v in data.items() if k not in ("cache_dir", "workers")}
-    if not (asked and asked.get("name")) or all(trained.get(k) == v for k, v in what.items()):
-        return data.name
-    return f"{data.name}-{digest(json.dumps(what, default=list))[:8]}"
+    if "name" not in asked or all(trained.get(k) == v for k, v in what.items()):
+        return data["name"]
+    return f"{data['name']}-{digest(json.dumps(what))[:8]}"
 
 
-def opened(settings: DictConfig, saved: dict[str, Any], asked: DictConfig | None):
+def opened(settings: dict[str, Any], saved: dict[str, Any], asked: dict[str, Any]):
     """The data with its test shapes ready. Errors: RunError if its labels mean another template."""
     from src.data.sources import open_data
 
     try:
-        data = open_data(OmegaConf.to_container(settings))
+        data = open_data(settings)
     except DataError as error:
-        if asked and asked.get("name"):
+        if "name" in asked:
             raise
         raise DataError(f"{error}; if the data set has moved: data.root=") from error
     if saved.get("template") != data.template_key:
+        classes = saved["hyper_parameters"]["num_classes"]
         raise RunError(
-            f"the labels of {settings.data.name} mean the {data.num_classes} vertices of another "
-            f"template than the {saved['hyper_parameters']['num_classes']} this run was trained on"
+            f"the labels of {settings['data']['name']} mean the {data.num_classes} vertices of "
+            f"another template than the one of {classes} that this run was trained on"
         )
     data.prepare(["test"])
     return data
@@ -176,8 +181,9 @@ def predictor(saved: dict[str, Any], settings: dict[str, Any], accelerator: str)
     module.to(device, torch.float64 if precision == "64-true" else torch.float32).eval()
 
     def predict(data, i: int, purpose: str):
-        batch = rotate(data.datasets["test"][i], settings["seed"], "spirals", purpose)
+        batch = data.datasets["test"][i]
         batch = module.transfer_batch_to_device(batch, torch.device(device), 0)
+        batch = rotate(batch, settings["seed"], "spirals", purpose)
         if precision == "64-true":
             batch = {key: value.double() if key in ("features", "vertices", "unit") else value
                      for key, value in batch.items()}  # fmt: skip

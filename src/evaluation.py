@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-import zipfile
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, fields
 from pathlib import Path
@@ -101,11 +100,15 @@ class Outcome:
         try:
             with np.load(path, allow_pickle=False) as file:
                 arrays = {f.name: file[f.name] for f in fields(cls)}
+            names, diameter = arrays.pop("names").tolist(), float(arrays.pop("diameter"))
+            first = arrays["first"]
+            lengths = {len(array) for name, array in arrays.items() if name != "first"}
+            if len(first) != len(names) + 1 or lengths != {int(first[-1])}:
+                raise ValueError("its arrays have different lengths")
         except FileNotFoundError:
             raise RunError(f"{path} is not there") from None
-        except (OSError, ValueError, EOFError, KeyError, zipfile.BadZipFile) as error:
+        except Exception as error:  # whatever a damaged file makes numpy say
             raise RunError(f"{path} is damaged ({str(error)[:100]})") from error
-        names, diameter = arrays.pop("names").tolist(), float(arrays.pop("diameter"))
         return cls(names, diameter=diameter, **arrays)
 
 

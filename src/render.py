@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import signal
 import sys
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
@@ -41,7 +42,8 @@ def render(rows: list[Row], up: str, views: tuple[str, ...] = VIEWS) -> list[Pic
     No display is needed, but an OpenGL library is. Errors: RenderError without one.
     """
     # VTK ends the whole process where it finds no OpenGL: so it has one of its own
-    with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as process:
+    context, ignore = get_context("spawn"), (signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for ours
+    with ProcessPoolExecutor(1, context, initializer=signal.signal, initargs=ignore) as process:
         try:
             return process.submit(_render, rows, up, views).result()
         except (BrokenProcessPool, ImportError) as error:

@@ -8,12 +8,14 @@ import re
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
 from omegaconf import DictConfig
 from tqdm import tqdm
 
 from src.cli import entry_point
 from src.config import ConfigError, typed
 from src.data.shapes import DataError
+from src.data.store import digest
 from src.geometry.mesh import MeshError
 from src.runs import write_whole
 
@@ -44,10 +46,11 @@ def main(config: DictConfig) -> None:
 
 def report(config: DictConfig) -> Path:
     """Write the page, its figures and tables. Returns their folder."""
-    from src.comparison import arrangements, as_csv, as_tex, collect, grouped, run_table
+    from src.comparison import arrangements, collect, grouped
     from src.figures import curve_figure, encoded
     from src.metrics import THRESHOLDS
     from src.page import page
+    from src.tables import as_csv, as_tex, run_table
 
     runs, broken = collect(config.runs)
     for _, reason in broken:
@@ -62,11 +65,13 @@ def report(config: DictConfig) -> Path:
         figure = curve_figure({name: (THRESHOLDS, several) for name, several in curves.items()})
         svg = encoded(figure, "svg").decode()
         drawn[title] = svg[svg.index("<svg") :]
-        name = re.sub(r"[^a-z0-9]+", "-", title.lower()).strip("-")
-        write_whole(folder / f"{name}.pdf", encoded(figure, "pdf"))
+        write_whole(folder / f"{file_name(title)}.pdf", encoded(figure, "pdf"))
     write_whole(folder / "table.csv", as_csv(*run_table(groups)))
     write_whole(folder / "table.tex", as_tex(groups))
     scenes, notes = looks(runs, config.shapes)
+    for group in groups:
+        if len(group.seeds) < len(group.runs):
+            notes.append(f"{group.label()}: a seed was run more than once")
     for note in notes:
         log.warning("%s", note)
     write_whole(folder / "index.html", page(groups, broken, drawn, scenes, notes))
@@ -74,8 +79,15 @@ def report(config: DictConfig) -> Path:
     return folder
 
 
+def file_name(title: str) -> str:
+    name = re.sub(r"[^a-z0-9]+", "-", title.lower().replace("++", " metric")).strip("-")
+    return name if len(name) <= 100 else f"{name[:100]}-{digest(title)[:8]}"
+
+
 def beside(runs: str) -> Path:
     """The folder that a pattern's places lie in, or the folder itself."""
+    if Path(runs).is_dir():
+        return Path(runs)
     parts = Path(runs).parts
     plain = next((i for i, part in enumerate(parts) if re.search(r"[*?\[]", part)), len(parts))
     return Path(*parts[:plain])
@@ -93,8 +105,10 @@ def looks(runs: list, count: int):
         try:
             data = open_data(run.config)
             for name in evenly(run.outcome.names, count):
-                mesh = data.shape(name).mesh
-                scenes.add(str(run.folder.relative_to(above)), name, mesh, data, run.outcome)
+                shape = data.shape(name)
+                if not np.array_equal(shape.labels, run.outcome.labels[run.outcome.mesh(name)]):
+                    raise DataError(f"{name} has changed since: other vertices, or other labels")
+                scenes.add(str(run.folder.relative_to(above)), name, shape.mesh, data, run.outcome)
         except (DataError, MeshError, OSError) as error:
             notes.append(f"{run.folder}: no view of its shapes ({error})")
     return scenes, notes

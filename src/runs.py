@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
 
 from src.config import ConfigError, checked, flat
 
@@ -117,8 +118,9 @@ def stored_config(folder: Path) -> dict[str, Any]:
     """The whole config of a run, in plain containers. Errors: RunError if it is not one."""
     try:
         return OmegaConf.to_container(checked(_load(folder)))
-    except ConfigError as error:
-        raise RunError(f"{folder / CONFIG} is no config of a run ({error})") from error
+    except (ConfigError, OmegaConfBaseException, KeyError, TypeError) as error:
+        reason = str(error).splitlines()[0]
+        raise RunError(f"{folder / CONFIG} is no config of a run ({reason})") from error
 
 
 def _load(folder: Path) -> DictConfig:

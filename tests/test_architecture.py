@@ -28,8 +28,9 @@ ALLOWED = {
     "plain": {"nn"},
     "measure": {"nn", "plain"},
     "growth": {"measure", "memory", "nn", "data"},
-    "comparison": {"config", "evaluation", "runs"},
-    "page": {"comparison", "data", "evaluation", "figures", "geometry", "render"},
+    "comparison": {"config", "data", "evaluation", "runs"},
+    "tables": {"comparison"},
+    "page": {"comparison", "tables", "data", "evaluation", "figures", "geometry", "render"},
     "summary": {"data", "evaluation", "figures", "metrics", "render", "runs"},
     "cli": {"config", "runs", "data", "geometry"},
 }
