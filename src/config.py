@@ -54,8 +54,15 @@ class Shot:
 
 
 @dataclass
+class Remesh:
+    policy: str = MISSING
+    vertices: int = MISSING
+
+
+@dataclass
 class Data:
     name: str = MISSING
+    remesh: Remesh | None = None
     shot: Shot = field(default_factory=Shot)
     shuffle_vertices: bool = False
     cache_dir: str = MISSING
@@ -127,14 +134,15 @@ DATASETS = {"bodies": Bodies, "faust": Faust, "faust_benchmark": FaustBenchmark,
 
 AT_LEAST = {
     "seq_len": 1, "seed": 0, "optim.epochs": 1, "optim.warmup": 0, "data.workers": 1,
-    "data.shot.bins": 1, "model.rings": 1, "model.patch.rings": 1, "trainer.threads": 1,
-    "trainer.val_every": 1,
+    "data.shot.bins": 1, "data.remesh.vertices": 12, "model.rings": 1, "model.patch.rings": 1,
+    "trainer.threads": 1, "trainer.val_every": 1,
 }  # fmt: skip
 ABOVE_ZERO = ("optim.lr", "data.shot.radius", "model.feature_scale", "model.patch.radius")
 ONE_OF = {
     "optim.schedule": ("cosine", "constant"),
     "model.metric_layers": ("all", "first"),
     "model.patch.weights": ("interpolation", "gaussian"),
+    "data.remesh.policy": ("isotropic", "adaptive", "refined", "simplified", "marching", "mixed"),
     "trainer.precision": ("32", "64", "bf16", "auto"),
 }
 
@@ -147,12 +155,7 @@ def checked(config: DictConfig) -> DictConfig:
     schema = OmegaConf.structured(Train)
     plain = OmegaConf.to_container(config, resolve=True)
     for group, schemas in (("model", MODELS), ("data", DATASETS)):
-        _is_group(plain[group], group)
-        name = plain[group].get("name")
-        if name not in schemas:
-            raise ConfigError(f"{group}.name must be one of {', '.join(schemas)}; got {name}")
-        _known(plain[group], schemas[name], f"{group}.")
-        schema[group] = OmegaConf.structured(schemas[name])
+        schema[group] = _one_of(plain[group], group, schemas)
     _known(plain, Train, "")
     _known(plain["trainer"], Trainer, "trainer.")
     _known(plain["optim"], Optim, "optim.")
@@ -174,6 +177,30 @@ def checked(config: DictConfig) -> DictConfig:
     return schema
 
 
+def checked_data(config: DictConfig) -> DictConfig:
+    """A data config alone, in the same way."""
+    plain = OmegaConf.to_container(config, resolve=True)
+    schema = _one_of(plain, "data", DATASETS)
+    _fill(schema, plain)
+    _check_values(OmegaConf.create({"data": schema}))
+    return schema
+
+
+def _one_of(plain: Any, group: str, schemas: dict[str, type]) -> DictConfig:
+    """The schema that a group's name chooses."""
+    _is_group(plain, group)
+    if plain.get("name") not in schemas:
+        raise ConfigError(
+            f"{group}.name must be one of {', '.join(schemas)}; got {plain.get('name')}"
+        )
+    _known(plain, schemas[plain["name"]], f"{group}.")
+    schema = OmegaConf.structured(schemas[plain["name"]])
+    if plain.get("remesh") is not None:
+        _known(plain["remesh"], Remesh, "data.remesh.")
+        schema.remesh = OmegaConf.structured(Remesh)
+    return schema
+
+
 def typed(config: DictConfig, schema: type) -> DictConfig:
     """A flat config with every value of its declared type. Errors: ConfigError as above."""
     plain = OmegaConf.to_container(config, resolve=True)
@@ -192,7 +219,8 @@ def _fill(schema: DictConfig, plain: dict[str, Any]) -> None:
             raise ConfigError(f"{key}={value}: {reason}") from error
 
 
-def _check_ranges(typed: DictConfig) -> None:
+def _check_values(typed: DictConfig) -> None:
+    """Those that need no others to be judged by."""
     for key, least in AT_LEAST.items():
         value = OmegaConf.select(typed, key)
         if value is not None and value < least:
@@ -204,6 +232,10 @@ def _check_ranges(typed: DictConfig) -> None:
     for key, values in ONE_OF.items():
         if (value := OmegaConf.select(typed, key)) not in (None, *values):
             raise ConfigError(f"{key} must be one of {', '.join(values)}; got {value}")
+
+
+def _check_ranges(typed: DictConfig) -> None:
+    _check_values(typed)
     if typed.trainer.val_every > typed.optim.epochs:
         raise ConfigError(
             f"trainer.val_every must be at most optim.epochs, {typed.optim.epochs}: without a "

@@ -119,9 +119,10 @@ def check(checkpoint: Path, config: dict) -> None:
 def describe(config: DictConfig, data, parameters: int, precision: str, seconds: float):
     """What is about to be trained, on what, and where its input is kept."""
     sizes = [len(data.shapes.names[split]) for split in ("train", "val", "test")]
+    made = f", remeshed ({config.data.remesh.policy})" if config.data.remesh else ""
     yield (
-        f"{config.data.name}: {sizes[0]} meshes to train on, {sizes[1]} to validate, {sizes[2]} to "
-        f"test; labels are the {data.num_classes} vertices of the template"
+        f"{config.data.name}{made}: {sizes[0]} meshes to train on, {sizes[1]} to validate, "
+        f"{sizes[2]} to test; labels are the {data.num_classes} vertices of the template"
     )
     yield (
         f"{config.model.name}: {parameters:,} parameters, {neighbourhoods(config)}; "

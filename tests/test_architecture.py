@@ -34,7 +34,7 @@ ALLOWED = {
     "summary": {"data", "evaluation", "figures", "metrics", "render", "runs"},
     "cli": {"config", "runs", "data", "geometry"},
 }
-ENTRY_POINTS = {"train", "evaluate", "match", "report", "benchmark"}
+ENTRY_POINTS = {"train", "evaluate", "match", "meshes", "report", "benchmark"}
 NOT_IN_GEOMETRY = {"torch", "hydra", "omegaconf", "lightning", "torchmetrics"}
 NOT_IN_NETWORKS = NOT_IN_GEOMETRY - {"torch"} | {"numpy", "trimesh", "potpourri3d", "numba"}
 

@@ -174,6 +174,7 @@ class CorrespondenceData(L.LightningDataModule):
             if not self.shapes.names[split]:
                 raise DataError(f"no mesh to {split}: the data set's split has none")
         names = [(split, name) for split in wanted for name in self.shapes.names[split]]
+        self.shapes.prepare([name for _, name in names])
         shapes, tasks = [], []
         for _, name in tqdm(names, desc="Meshes", unit="mesh", delay=1.0):
             shape = self.shape(name)

@@ -85,6 +85,9 @@ class ShapeSet(ABC):
     names: dict[str, list[str]]
     up = "y"
 
+    def prepare(self, names: list[str]) -> None:  # noqa: B027
+        """Compute what `load` needs for those shapes, if it needs any such thing."""
+
     @abstractmethod
     def load(self, name: str) -> Shape:
         """The shape of that name. Errors: MeshError, DataError."""

@@ -10,17 +10,22 @@ from src.data.faust import Faust
 from src.data.faust_benchmark import FaustBenchmark
 from src.data.folder import Folder
 from src.data.preprocessing import PatchRecipe, Recipe
+from src.data.remeshed import Remeshed
 from src.data.shapes import ShapeSet
 from src.data.store import Store
 
 SOURCES = {"bodies": Bodies, "faust": Faust, "faust_benchmark": FaustBenchmark, "folder": Folder}
-COMMON = ("name", "shot", "shuffle_vertices", "cache_dir", "workers")  # not the source's affair
+# not the source's affair
+COMMON = ("name", "remesh", "shot", "shuffle_vertices", "cache_dir", "workers")
 
 
 def open_shapes(data: dict[str, Any]) -> ShapeSet:
     """The data set that a data config describes. Errors: DataError, MeshError."""
     options = {key: value for key, value in data.items() if key not in COMMON}
-    return SOURCES[data["name"]](**options)
+    shapes = SOURCES[data["name"]](**options)
+    if data.get("remesh"):
+        return Remeshed(shapes, Store(data["cache_dir"]), data["workers"], **data["remesh"])
+    return shapes
 
 
 def open_data(config: dict[str, Any]) -> CorrespondenceData:

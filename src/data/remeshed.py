@@ -1,0 +1,69 @@
+"""Any data set with each shape remeshed on its own: no connectivity gives a vertex away."""
+
+from __future__ import annotations
+
+from importlib.metadata import PackageNotFoundError, version
+
+import numpy as np
+
+from src.data.preprocessing import Task, load_task, run_tasks
+from src.data.shapes import DataError, Shape, ShapeSet, SurfacePoints
+from src.data.store import Arrays, Store, code_version, digest
+from src.geometry import mesh as meshes
+from src.geometry import remesh
+from src.geometry.mesh import Mesh
+
+
+class Remeshed(ShapeSet):
+    """The shapes of another set, each with a tessellation of its own, made once and kept.
+
+    Its template, names and split are those of the other set. The truth of a vertex is a point of
+    the template: the one that its closest point on the original shape stands for; its label is the
+    nearest corner of that face. policy, vertices: as `src.geometry.remesh.remesh` takes them; the
+    seed is drawn from the shape's content. Errors: DataError without PyMeshLab.
+    """
+
+    def __init__(
+        self, base: ShapeSet, store: Store, workers: int | None, policy: str, vertices: int
+    ) -> None:
+        try:
+            self._version = version("pymeshlab")
+        except PackageNotFoundError as error:
+            raise DataError("remeshing needs PyMeshLab: pip install -e '.[remesh]'") from error
+        self._base, self._store, self._workers = base, store, workers
+        self._policy, self._vertices = policy, vertices
+        self.template, self.names, self.up = base.template, base.names, base.up
+
+    def prepare(self, names: list[str]) -> None:
+        self._base.prepare(names)
+        tasks = [self._task(self._base.load(name).mesh) for name in names]
+        run_tasks(tasks, self._store, self._workers, "Remeshing")
+
+    def load(self, name: str) -> Shape:
+        source = self.source(name)
+        kept = load_task(self._task(source.mesh), self._store)
+        corners = source.labels[source.mesh.faces[kept["face"]]]
+        shape = Mesh(kept["vertices"], kept["faces"], source.mesh.name)
+        place = self.template.vertices
+        point = np.einsum("vk,vkx->vx", kept["weights"], place[corners])
+        nearest = np.linalg.norm(place[corners] - point[:, None], axis=2).argmin(axis=1)
+        labels = corners[np.arange(len(corners)), nearest]
+        points = SurfacePoints(corners, kept["weights"])
+        return Shape(shape, labels, len(place), points)
+
+    def source(self, name: str) -> Shape:
+        """The shape that the one of that name was made from."""
+        return self._base.load(name)
+
+    def _task(self, source: Mesh) -> Task:
+        what = source.vertices, source.faces, self._policy
+        code = code_version(remesh, meshes)
+        key = digest(*what, self._vertices, code, self._version)
+        seed = int(digest(*what)[:15], 16)
+        return Task("meshes", key, _remesh, (source, self._vertices, self._policy, seed))
+
+
+def _remesh(source: Mesh, vertices: int, policy: str, seed: int) -> Arrays:
+    made = remesh.remesh(source, vertices, policy, seed)
+    return {"vertices": made.mesh.vertices, "faces": made.mesh.faces.astype(np.int32),
+            "face": made.faces.astype(np.int32), "weights": made.weights}  # fmt: skip

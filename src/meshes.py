@@ -1,0 +1,125 @@
+"""What the meshes of a data set are like: `python -m src.meshes data=bodies_remeshed`."""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from omegaconf import DictConfig, OmegaConf
+from tqdm import tqdm
+
+from src.cli import entry_point
+from src.config import ConfigError, checked_data, typed
+from src.data.shapes import SPLITS, Shape, ShapeSet
+from src.geometry.mesh import Mesh
+
+log = logging.getLogger("src.meshes")
+COLUMNS = ("vertices", "faces", "parts", "closed", "genus", "edges cv", "least angle", "shared",
+           "off source", "off label")  # fmt: skip
+
+
+@dataclass
+class Meshes:
+    data: Any = None
+    split: str | None = None
+
+
+def check(config: DictConfig) -> DictConfig:
+    plain = OmegaConf.to_container(config, resolve=True)
+    data = checked_data(OmegaConf.create(plain.pop("data")))
+    found = typed(OmegaConf.create(plain), Meshes)
+    if found.split not in (None, *SPLITS):
+        raise ConfigError(f"split must be one of {', '.join(SPLITS)}; got {found.split}")
+    found.data = data
+    return found
+
+
+@entry_point("meshes", check)
+def main(config: DictConfig) -> None:
+    from src.data.sources import open_shapes
+
+    shapes = open_shapes(OmegaConf.to_container(config.data))
+    names = [n for split in SPLITS if config.split in (None, split) for n in shapes.names[split]]
+    shapes.prepare(names)
+    log.info("%s", HELP)
+    width = max(map(len, names))
+    log.info("%s", " ".join([" " * width, *(f"{column:>11}" for column in COLUMNS)]))
+    rows, before = [], shapes.load(names[-1])
+    for name in tqdm(names, desc="Meshes", leave=False, delay=1.0):
+        shape = shapes.load(name)
+        rows.append(row(shape, before, shapes, name))
+        before = shape
+        tqdm.write(" ".join([name.ljust(width), *map(shown, rows[-1])]))
+    means = [
+        np.mean([r[i] for r in rows if r[i] is not None] or [np.nan]) for i in range(len(COLUMNS))
+    ]
+    log.info("%s", " ".join(["mean".ljust(width), *map(shown, map(float, means))]))
+
+
+HELP = """\
+parts: connected components. closed: no boundary, every edge between two faces. edges cv: spread of
+the edges' lengths over their mean. least angle: of a face, in degrees, the median. shared: edges
+that join the same two vertices of the template as one of the mesh in the line above. off source:
+the farthest that this mesh and the one it was made from are apart, either way, over the mean edge.
+off label: the mean distance from the true point to its label, over the mean edge.
+"""
+
+
+def shown(value: float | int | bool | None) -> str:
+    if value is None or value != value:
+        return f"{'-':>11}"
+    if isinstance(value, float):
+        return f"{value:11.2f}"
+    return f"{('yes' if value else 'no') if isinstance(value, bool) else value:>11}"
+
+
+def row(shape: Shape, before: Shape, shapes: ShapeSet, name: str) -> list[Any]:
+    """The values of COLUMNS."""
+    import trimesh
+
+    from src.data.remeshed import Remeshed
+
+    mesh = shape.mesh
+    solid = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
+    lengths, parts = solid.edges_unique_length, int(solid.body_count)
+    off_source = off_label = None
+    if isinstance(shapes, Remeshed):
+        off_source = apart(mesh, shapes.source(name).mesh) / lengths.mean()
+    if shape.points is not None:
+        place = shapes.template.vertices
+        point = np.einsum("vk,vkx->vx", shape.points.weights, place[shape.points.corners])
+        off_label = np.linalg.norm(point - place[shape.labels], axis=1).mean() / lengths.mean()
+    closed = bool(solid.is_watertight)
+    genus = int(parts - solid.euler_number // 2) if closed else None
+    return [len(mesh.vertices), len(mesh.faces), parts, closed, genus,
+            float(lengths.std() / lengths.mean()),
+            float(np.median(np.degrees(solid.face_angles.min(axis=1)))),
+            shared(shape, before), off_source, off_label]  # fmt: skip
+
+
+def apart(one: Mesh, two: Mesh) -> float:
+    """The farthest that a vertex of one mesh is from the surface of the other."""
+    from src.geometry.remesh import closest_points
+
+    return max(
+        float(closest_points(b, a.vertices, a.vertex_normals)[2].max())
+        for a, b in ((one, two), (two, one))
+    )
+
+
+def shared(shape: Shape, other: Shape) -> float:
+    """The share of this mesh's edges that the other has too, both read as edges of the template."""
+    one, two = (edges(s) for s in (shape, other))
+    return len(one & two) / max(len(one), 1)
+
+
+def edges(shape: Shape) -> set[tuple[int, int]]:
+    pairs = shape.labels[shape.mesh.faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)]
+    pairs = np.sort(pairs[pairs[:, 0] != pairs[:, 1]], axis=1)
+    return set(map(tuple, np.unique(pairs, axis=0).tolist()))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,132 @@
+"""Remeshed data sets: made once, with a truth that lies within faces."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+
+from src.data.remeshed import Remeshed
+from src.data.shapes import DataError, ShapeSet, registered_shape
+from src.data.sources import open_shapes
+from src.data.store import Store
+from src.geometry import remesh as module
+from src.meshes import edges, main, shared
+from src.runs import METRICS
+from tests.conftest import toy_shapes
+from tests.test_cli import cli  # noqa: F401
+from tests.test_train import FIGURES, run
+
+
+class Toys(ShapeSet):
+    def __init__(self):
+        self._shapes = toy_shapes()
+        self.template = self._shapes["template.ply"]
+        self.names = {
+            "train": ["train/0.ply", "train/1.ply"],
+            "val": ["val/0.ply"],
+            "test": ["test/0.ply"],
+        }
+
+    def load(self, name):
+        return registered_shape(self._shapes[name], self.template)
+
+
+@pytest.fixture
+def toys(tmp_path):
+    return Remeshed(Toys(), Store(tmp_path), 1, "isotropic", 120)
+
+
+def test_a_shape_is_remeshed_once_and_kept(toys, monkeypatch):
+    toys.prepare(["train/0.ply", "train/1.ply"])
+    monkeypatch.setattr(module, "remesh", None)  # from here on it would fail
+    shape = toys.load("train/0.ply")
+    assert len(shape.mesh.vertices) == 120 and shape.template_size == 162
+    again = toys.load("train/0.ply")
+    np.testing.assert_array_equal(shape.mesh.vertices, again.mesh.vertices)
+    with pytest.raises(TypeError):
+        toys.load("val/0.ply")
+
+
+def test_the_truth_is_where_the_vertex_lies(toys):
+    """On the shape itself: the template's point, carried over, is at the vertex."""
+    shape, source = toys.load("test/0.ply"), toys.source("test/0.ply").mesh
+    point = np.einsum("vk,vkx->vx", shape.points.weights, source.vertices[shape.points.corners])
+    assert np.linalg.norm(point - shape.mesh.vertices, axis=1).max() < 0.05
+    place = toys.template.vertices
+    point = np.einsum("vk,vkx->vx", shape.points.weights, place[shape.points.corners])
+    each = np.linalg.norm(place[shape.points.corners] - point[:, None], axis=2)
+    chosen = np.linalg.norm(place[shape.labels] - point, axis=1)
+    np.testing.assert_allclose(chosen, each.min(axis=1))
+
+
+def test_no_two_shapes_have_their_edges_in_common(tmp_path):
+    """The bodies themselves: under half of the edges, as the template reads them."""
+    remesh = {"policy": "isotropic", "vertices": 1100}
+    kept = {"cache_dir": str(tmp_path), "workers": 1}
+    shapes = open_shapes({"name": "bodies", "vertices": 1500, "remesh": remesh, **kept})
+    one, two = (shapes.load(name) for name in shapes.names["test"][:2])
+    assert 0 < shared(one, two) < 0.5
+    registered = [shapes.source(name) for name in shapes.names["test"][:2]]
+    assert shared(*registered) == 1
+    assert len(edges(registered[0])) == len(registered[0].mesh.faces) * 3 // 2
+
+
+def test_another_policy_or_size_is_another_mesh(toys, tmp_path):
+    one = toys.load("val/0.ply").mesh
+    for policy, size in (("isotropic", 110), ("adaptive", 120)):
+        other = Remeshed(Toys(), Store(tmp_path), 1, policy, size).load("val/0.ply").mesh
+        assert other.vertices.shape != one.vertices.shape or (other.vertices != one.vertices).any()
+
+
+def test_without_pymeshlab_there_is_one_line(tmp_path, monkeypatch):
+    monkeypatch.setattr("src.data.remeshed.version", lambda _: raise_missing())
+    with pytest.raises(DataError, match=r"pip install -e '.\[remesh\]'"):
+        Remeshed(Toys(), Store(tmp_path), 1, "isotropic", 120)
+
+
+def raise_missing():
+    from importlib.metadata import PackageNotFoundError
+
+    raise PackageNotFoundError("pymeshlab")
+
+
+REMESHED = "data=bodies_remeshed"
+REMESH = ["+data.remesh.policy=mixed", "+data.remesh.vertices=120"]
+
+
+@pytest.mark.parametrize("model", [["metric=true"], ["model=gcnn3", "model.patch.radius=0.2"]])
+def test_networks_train_on_remeshed_shapes(toy_overrides, tmp_path, model):
+    metrics = run(tmp_path, [*toy_overrides, *REMESH, *model, "optim.epochs=1"])
+    assert metrics.keys() >= FIGURES
+    assert metrics["test/within_0.01"] < 0.2  # hardly any truth is a vertex
+    assert json.loads((tmp_path / METRICS).read_text()) == metrics
+
+
+def test_the_meshes_of_a_data_set_in_a_table(cli, toy_overrides):  # noqa: F811
+    data = [o for o in toy_overrides if o.startswith("data") and "shot" not in o]
+    code, out, err = cli(*data, *REMESH, "split=test", program=main)
+    assert code == 0, err
+    lines = [line.split() for line in out.splitlines() if line.startswith(("test_", "mean"))]
+    assert [line[0] for line in lines] == ["test_0", "test_1", "test_2", "mean"]
+    for line in lines[:-1]:
+        assert 114 <= int(line[1]) <= 120 and line[4] == "yes" and line[5] == "0"
+    assert float(lines[-1][8]) < 0.8  # shared edges
+    code, out, err = cli(*data, "split=test", program=main)  # as registered
+    lines = [line.split() for line in out.splitlines() if line.startswith("test_")]
+    assert code == 0 and all(line[8:] == ["1.00", "-", "-"] for line in lines)
+
+
+@pytest.mark.parametrize(
+    "arguments, message",
+    [
+        (["split=exam"], "split must be one of train, val, test; got exam"),
+        ([REMESHED, "data.remesh.policy=knitted"], "data.remesh.policy must be one of"),
+        ([REMESHED, "data.remesh.vertices=3"], "data.remesh.vertices must be at least 12"),
+        ([REMESHED, "+data.remesh.depth=3"], "unknown key data.remesh.depth"),
+    ],
+)  # fmt: skip
+def test_a_mistake_is_one_clear_line(cli, arguments, message):  # noqa: F811
+    code, out, err = cli(*arguments, program=main)
+    assert code == 1 and message in (out + err).strip().splitlines()[-1]

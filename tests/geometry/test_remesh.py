@@ -1,0 +1,149 @@
+"""Other tessellations of one surface, and the points that their vertices came from."""
+
+from __future__ import annotations
+
+import builtins
+
+import numpy as np
+import pytest
+import trimesh
+
+from src.config import ONE_OF
+from src.geometry.mesh import Mesh, MeshError
+from src.geometry.remesh import POLICIES, Tool, closest_points, remesh
+from tests.meshes import bumpy_sphere, lattice
+
+KINDS = [policy for policy in POLICIES if policy != "mixed"]
+
+
+@pytest.fixture(scope="module")
+def surface():
+    return bumpy_sphere(1, subdivisions=3, bump=0.4)
+
+
+def solid(mesh):
+    return trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
+
+
+@pytest.mark.parametrize("policy", KINDS)
+def test_another_tessellation_of_the_same_surface(surface, policy):
+    made = remesh(surface, 400, policy, seed=2)
+    mesh, shape = made.mesh, solid(made.mesh)
+    assert 0.95 * 400 <= len(mesh.vertices) <= 400
+    if policy != "marching":
+        assert len(mesh.vertices) == 400
+    assert shape.is_watertight and shape.is_winding_consistent
+    assert shape.body_count == 1 and shape.euler_number == 2  # one closed piece of genus 0
+    edge = shape.edges_unique_length.mean()
+    assert made.distance.max() < (0.9 if policy == "marching" else 0.3) * edge
+    _, _, back = closest_points(mesh, surface.vertices, surface.vertex_normals)
+    assert back.max() < edge  # nothing is lost
+    point = np.einsum("vk,vkx->vx", made.weights, surface.vertices[surface.faces[made.faces]])
+    np.testing.assert_allclose(
+        np.linalg.norm(point - mesh.vertices, axis=1), made.distance, atol=1e-6
+    )
+    np.testing.assert_allclose(made.weights.sum(axis=1), 1)
+    assert (made.weights >= 0).all()
+
+
+def test_one_seed_one_mesh_and_another_another(surface):
+    one, same, other = (remesh(surface, 300, seed=seed).mesh for seed in (1, 1, 2))
+    np.testing.assert_array_equal(one.vertices, same.vertices)
+    np.testing.assert_array_equal(one.faces, same.faces)
+    assert one.faces.shape != other.faces.shape or (one.faces != other.faces).any()
+
+
+def test_policies_differ_as_they_say(surface):
+    """Spread of edge lengths, and the shape of triangles."""
+    made = {policy: solid(remesh(surface, 600, policy, seed=0).mesh) for policy in KINDS}
+    spread = {
+        k: m.edges_unique_length.std() / m.edges_unique_length.mean() for k, m in made.items()
+    }
+    angle = {k: np.median(m.face_angles.min(axis=1)) for k, m in made.items()}
+    slivers = {k: np.percentile(m.face_angles.min(axis=1), 5) for k, m in made.items()}
+    assert all(spread["isotropic"] < spread[k] for k in KINDS if k != "isotropic")
+    assert spread["refined"] > 1.5 * spread["isotropic"]
+    assert angle["simplified"] < angle["isotropic"]
+    assert slivers["marching"] < 0.5 * slivers["isotropic"]
+
+
+def test_mixed_draws_one_of_the_others(surface, monkeypatch):
+    drawn = []
+    for kind in KINDS:
+        monkeypatch.setitem(POLICIES, kind, lambda tool, rng, kind=kind: drawn.append(kind))
+    for seed in range(30):
+        remesh(surface, len(surface.vertices) - 2, "mixed", seed)
+    assert set(drawn) == set(KINDS)
+
+
+def test_where_two_sheets_touch_a_vertex_stays_on_its_own():
+    """A flat box, 0.01 thick: the other side is nearer than many a point of the own side."""
+    box = trimesh.creation.box((1, 1, 0.01)).subdivide().subdivide().subdivide()
+    box = Mesh(box.vertices, box.faces)
+    flat = np.abs(box.vertices[:, 2]) > 0.004
+    points = box.vertices.copy()
+    points[:, 2] *= -0.2  # pushed through, nearer to the other side
+    normals = np.zeros_like(points)
+    normals[:, 2] = np.sign(box.vertices[:, 2])
+    inner = (np.abs(box.vertices[:, :2]) < 0.4).all(axis=1) & flat
+    face, weights, _ = closest_points(box, points[inner], normals[inner])
+    reached = np.einsum("qk,qkx->qx", weights, box.vertices[box.faces[face]])
+    np.testing.assert_allclose(reached, box.vertices[inner], atol=1e-9)
+
+
+def test_closest_points_are_those_of_all_faces(surface):
+    rng = np.random.default_rng(0)
+    points = (
+        surface.vertices[rng.integers(len(surface.vertices), size=60)]
+        + rng.normal(size=(60, 3)) / 5
+    )
+    normals = rng.normal(size=(60, 3))
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    face, weights, distance = closest_points(surface, points, normals)
+    triangles = surface.vertices[surface.faces]
+    unit = surface.face_normals / np.linalg.norm(surface.face_normals, axis=1, keepdims=True)
+    for point, normal, found, weight, far in zip(
+        points, normals, face, weights, distance, strict=True
+    ):
+        every = trimesh.triangles.closest_point(triangles, np.tile(point, (len(triangles), 1)))
+        each = np.linalg.norm(every - point, axis=1)
+        each[unit @ normal < 0.2] = np.inf
+        assert far == pytest.approx(each.min()) and each[found] == pytest.approx(far)
+        np.testing.assert_allclose(weight @ triangles[found], every[found], atol=1e-9)
+
+
+def test_without_a_face_that_agrees_the_nearest_counts():
+    plane = lattice(4, 4)
+    up = plane.face_normals[0] / np.linalg.norm(plane.face_normals[0])
+    face, weights, distance = closest_points(plane, plane.vertices[5:6] + up, -up[None])
+    assert distance[0] == pytest.approx(1)
+    np.testing.assert_allclose(weights[0] @ plane.vertices[plane.faces[face[0]]], plane.vertices[5])
+
+
+@pytest.mark.parametrize(
+    "arguments, message",
+    [
+        ((300, "knitted"), "policy must be one of isotropic, adaptive, .*; got 'knitted'"),
+        ((5, "isotropic"), "a mesh of 5 vertices is no surface"),
+    ],
+)
+def test_what_cannot_be_is_refused(surface, arguments, message):
+    with pytest.raises(MeshError, match=message):
+        remesh(surface, *arguments)
+
+
+def test_without_pymeshlab_one_line_names_the_extra(surface, monkeypatch):
+    real = builtins.__import__
+
+    def without(name, *arguments, **options):
+        if name == "pymeshlab":
+            raise ImportError(name)
+        return real(name, *arguments, **options)
+
+    monkeypatch.setattr(builtins, "__import__", without)
+    with pytest.raises(MeshError, match=r"pip install -e '.\[remesh\]'"):
+        Tool(surface, 100, np.random.default_rng(0))
+
+
+def test_the_config_knows_every_policy():
+    assert ONE_OF["data.remesh.policy"] == tuple(POLICIES)
