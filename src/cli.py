@@ -2,20 +2,18 @@
 
 from __future__ import annotations
 
-import contextlib
-import hashlib
 import itertools
 import logging
 import os
-import re
 import signal
 import sys
 from collections.abc import Callable
 from pathlib import Path
 
 import hydra
-from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.core.hydra_config import HydraConfig
 from hydra.errors import HydraException
+from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
@@ -23,6 +21,7 @@ from src.config import ConfigError
 from src.data.shapes import DataError
 from src.geometry.mesh import MeshError
 from src.runs import RunError, Stopped
+from src.sweeps import job_folder, note_failure, sweep_folder
 
 CONF = str(Path(__file__).parents[1] / "conf")
 USER_ERRORS = (ConfigError, DataError, MeshError, RunError, OSError, HydraException,
@@ -34,26 +33,6 @@ log = logging.getLogger("src")
 def run_folder(resume: str | None, new: str) -> str:
     """Hydra's run folder: that of the run to go on with, if it is there."""
     return resume if resume and Path(resume).is_dir() else new
-
-
-def job_folder(overrides: list[str], number: int) -> str:
-    """A job's folder in a sweep, named by the settings that the sweep varies.
-
-    overrides: the job's own. Those that the command line gives one value are the same in every job.
-    """
-    parse = OverridesParser.create().parse_override
-    fixed = set()
-    for word in sys.argv[1:]:
-        with contextlib.suppress(HydraException):
-            override = parse(word)
-            if not override.is_sweep_override():
-                fixed.add(override.key_or_group)
-    varied = [o.lstrip("+") for o in overrides if parse(o).key_or_group not in fixed]
-    name = "_".join(varied).replace("=", "-") or str(number)
-    legal = re.sub(r"[^\w.+-]+", "-", name)[:120]
-    if legal != name:  # what was lost may be what tells two jobs apart
-        legal += "-" + hashlib.sha256(name.encode()).hexdigest()[:8]
-    return legal
 
 
 def entry_point(
@@ -70,20 +49,29 @@ def entry_point(
         failed: list[str] = []
 
         def job(config: DictConfig) -> None:
+            hydra_ = HydraConfig.get()
+            folder = Path(hydra_.runtime.output_dir) if hydra_.mode == RunMode.MULTIRUN else None
+            if folder:
+                note_failure(folder, None)
             try:
                 task(check(config))
+                return
             except USER_ERRORS as error:
-                log.error("error: %s", one_line(error))
-                failed.append(one_line(error))
+                reason = one_line(error)
+                log.error("error: %s", reason)
             except Exception as error:
+                reason = repr(error)
                 log.exception("error: this should not have happened")
-                failed.append(repr(error))
+            failed.append(reason)
+            if folder:
+                note_failure(folder, reason)
 
         def main() -> None:
             failed.clear()
             os.environ.setdefault("HYDRA_FULL_ERROR", "1")  # Hydra hands errors on: we word them
             OmegaConf.register_new_resolver("run_folder", run_folder, replace=True)
             OmegaConf.register_new_resolver("job_folder", job_folder, replace=True)
+            OmegaConf.register_new_resolver("sweep_folder", sweep_folder, replace=True)
             signal.signal(signal.SIGTERM, _stop)
             signal.signal(signal.SIGINT, _stop)
             try:

@@ -14,6 +14,7 @@ from src.config import checked, flat
 from src.runs import (
     BEST,
     LAST,
+    METRICS,
     RunError,
     Stopped,
     claim,
@@ -28,6 +29,7 @@ log = logging.getLogger("src.train")
 @entry_point("train", checked)
 def main(config: DictConfig) -> None:
     from hydra.core.hydra_config import HydraConfig
+    from hydra.types import RunMode
 
     hydra = HydraConfig.get()
     folder = Path(hydra.runtime.output_dir)
@@ -38,11 +40,16 @@ def main(config: DictConfig) -> None:
         config = checked(continued(config, list(hydra.overrides.task)))
     else:
         claim(folder, config)
+    in_sweep = hydra.mode == RunMode.MULTIRUN
+    if in_sweep and (folder / METRICS).is_file():
+        log.info("finished before: %s", folder)
+        return
     try:
         train(config, folder)
     except Stopped as stopped:
-        how = f"Stopped. To go on: python -m src.train {shlex.quote(f'resume={folder}')}"
-        raise Stopped(stopped.signum, how) from None
+        resume = f"python -m src.train {shlex.quote(f'resume={folder}')}"
+        how = "the same command" if in_sweep else resume
+        raise Stopped(stopped.signum, f"Stopped. To go on: {how}") from None
 
 
 def train(config: DictConfig, folder: Path) -> dict[str, float]:

@@ -32,7 +32,8 @@ ALLOWED = {
     "tables": {"comparison"},
     "page": {"comparison", "tables", "data", "evaluation", "figures", "geometry", "render"},
     "summary": {"data", "evaluation", "figures", "metrics", "render", "runs"},
-    "cli": {"config", "runs", "data", "geometry"},
+    "sweeps": {"runs"},
+    "cli": {"config", "runs", "sweeps", "data", "geometry"},
 }
 ENTRY_POINTS = {"train", "evaluate", "match", "meshes", "report", "benchmark"}
 NOT_IN_GEOMETRY = {"torch", "hydra", "omegaconf", "lightning", "torchmetrics"}

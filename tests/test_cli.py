@@ -12,8 +12,8 @@ import torch
 from hydra.core.global_hydra import GlobalHydra
 from omegaconf import OmegaConf
 
-from src.cli import job_folder
 from src.config import ConfigError
+from src.sweeps import job_folder
 from src.train import main
 from tests.test_train import FIGURES, ROOT, composed
 
@@ -123,7 +123,7 @@ def test_the_root_metric_wins_over_what_an_experiment_sets_of_the_model():
         (["seq_len=0"], "seq_len must be at least 1; got 0"),
         (["seq_len=many"], "seq_len=many: Value 'many' of type 'str' could not be converted"),
         (["model=foo"], "Could not find 'model/foo'; there are: fcs, gcnn3, lstm"),
-        (["data=foo"], "there are: bodies, bodies_6890, faust, faust_benchmark, folder"),
+        (["data=foo"], "there are: bodies, bodies_6890, bodies_6890_remeshed, bodies_mixed,"),
         (["+metrics=true"], "unknown key metrics; did you mean metric?"),
         (["+rate=1"], "unknown key rate; known: seq_len"),
         (["metrics=true"], "Could not override 'metrics'"),

@@ -1,0 +1,88 @@
+"""Sweeps that can be killed and started again: names of their folders, and a table at the end."""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import json
+import logging
+import re
+import sys
+from pathlib import Path
+from typing import Any
+
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.errors import HydraException
+from hydra.experimental.callback import Callback
+from omegaconf import DictConfig
+
+from src.runs import CONFIG, LAST, METRICS, write_whole
+
+FAILED = "failed.txt"  # in the folder of a job that failed: why, in a line
+log = logging.getLogger("src")
+
+
+def sweep_folder() -> str:
+    """A sweep's folder, named by its command line: the same command finds its jobs again."""
+    words = [word for word in sys.argv[1:] if not word.lstrip("+~").startswith(("-", "hydra."))]
+    return legal_name("_".join(word.lstrip("+") for word in words).replace("=", "-")) or "sweep"
+
+
+def job_folder(overrides: list[str], number: int) -> str:
+    """A job's folder in a sweep, named by the settings that the sweep varies.
+
+    overrides: the job's own. Those that the command line gives one value are the same in every job.
+    """
+    parse = OverridesParser.create().parse_override
+    fixed = set()
+    for word in sys.argv[1:]:
+        with contextlib.suppress(HydraException):
+            override = parse(word)
+            if not override.is_sweep_override():
+                fixed.add(override.key_or_group)
+    varied = [o.lstrip("+") for o in overrides if parse(o).key_or_group not in fixed]
+    return legal_name("_".join(varied).replace("=", "-")) or str(number)
+
+
+def legal_name(name: str) -> str:
+    legal = re.sub(r"[^\w.+-]+", "-", name)[:120]
+    if legal != name:  # what was lost may be what tells two of them apart
+        legal += "-" + hashlib.sha256(name.encode()).hexdigest()[:8]
+    return legal
+
+
+def note_failure(folder: Path, reason: str | None) -> None:
+    """Keep why a job failed, for the table; None: it has not, so far."""
+    if reason is None:
+        (folder / FAILED).unlink(missing_ok=True)
+    else:
+        with contextlib.suppress(OSError):
+            write_whole(folder / FAILED, reason + "\n")
+
+
+def states(folder: Path) -> list[tuple[str, str, str]]:
+    """For each job of a sweep its folder, its state and its figures, or why it has none."""
+    found = []
+    for job in sorted(path for path in folder.iterdir() if path.is_dir()):
+        if (job / FAILED).is_file():
+            found.append((job.name, "failed", (job / FAILED).read_text().strip()))
+        elif (job / METRICS).is_file():
+            metrics = json.loads((job / METRICS).read_text())
+            exact, error = metrics["test/exact_match"], metrics["test/geodesic_error"]
+            found.append((job.name, "finished", f"{100 * exact:.2f} % exact, error {error:.4f}"))
+        elif (job / CONFIG).is_file():
+            how = "goes on with the same command" if (job / LAST).is_file() else "no epoch yet"
+            found.append((job.name, "stopped", how))
+    return found
+
+
+class Table(Callback):
+    """At the end of a sweep, by Hydra's leave: what finished, what failed, and why."""
+
+    def on_multirun_end(self, config: DictConfig, **_: Any) -> None:
+        folder = Path(config.hydra.sweep.dir)
+        rows = states(folder)
+        widths = [max([len(row[i]) for row in rows] or [0]) for i in range(2)]
+        lines = [f"  {job:<{widths[0]}}  {state:<{widths[1]}}  {what}" for job, state, what in rows]
+        print("\n".join([f"\nSweep {folder}:", *lines]))
+        print(f"To see them all: python -m src.report runs={folder}")

@@ -1,0 +1,97 @@
+"""Sweeps: killed and started again with the same command, they do only what is left."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from src.runs import LAST, METRICS
+from src.sweeps import FAILED, legal_name, states, sweep_folder
+from tests.test_cli import QUICK, cli  # noqa: F401
+from tests.test_train import ROOT, run, weights
+
+SWEEP = ["-m", "seed=0,1,2", "optim.epochs=40"]
+
+
+def test_a_killed_sweep_does_what_is_left(cli, toy_overrides, tmp_path):  # noqa: F811
+    toy = [o for o in toy_overrides if not o.startswith("optim")]
+    command = [*SWEEP, *toy]
+    env = {**os.environ, "PYTHONPATH": str(ROOT)}
+    process = subprocess.Popen([sys.executable, "-m", "src.train", *command], cwd=tmp_path, env=env,
+                               stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)  # fmt: skip
+    end = time.monotonic() + 120
+    while not (second := list((tmp_path / "outputs/sweeps").glob(f"*/seed-1/{LAST}"))):
+        assert process.poll() is None and time.monotonic() < end
+        time.sleep(0.02)
+    process.send_signal(signal.SIGKILL)
+    process.wait()
+    sweep = second[0].parents[2]
+    assert [(job, state) for job, state, _ in states(sweep)] == [
+        ("seed-0", "finished"), ("seed-1", "stopped")]  # fmt: skip
+    first = (sweep / "seed-0" / METRICS).stat().st_mtime_ns
+
+    code, out, err = cli(*command)
+    assert code == 0, err
+    assert [state for _, state, _ in states(sweep)] == 3 * ["finished"]
+    assert (sweep / "seed-0" / METRICS).stat().st_mtime_ns == first
+    assert (
+        "finished before: " in out
+        and f"python -m src.report runs={sweep.relative_to(tmp_path)}" in out
+    )
+    whole = tmp_path / "whole"
+    run(whole, [*toy, "optim.epochs=40", "seed=1"])
+    kept, expected = weights(sweep / "seed-1"), weights(whole)
+    assert all((kept[key] == expected[key]).all() for key in expected)
+
+
+def test_what_failed_is_in_the_table_and_tried_again(cli, toy_overrides, monkeypatch):  # noqa: F811
+    command = ["-m", "data.shot.bins=4,5", *toy_overrides, *QUICK]
+    command = [word for word in command if word != "data.shot.bins=4"]
+    from src.data import preprocessing
+
+    real = preprocessing._descriptors
+
+    def fails(mesh, radius, bins):
+        if bins == 5:
+            raise RuntimeError("out of ink")
+        return real(mesh, radius, bins)
+
+    monkeypatch.setattr(preprocessing, "_descriptors", fails)
+    code, out, _ = cli(*command)
+    assert code == 1
+    [sweep] = Path("outputs/sweeps").iterdir()
+    assert [row[:2] for row in states(sweep)] == [
+        ("data.shot.bins-4", "finished"), ("data.shot.bins-5", "failed")]  # fmt: skip
+    assert "failed    RuntimeError('out of ink')" in out
+    assert "Traceback" in (sweep / "data.shot.bins-5" / "train.log").read_text()
+    monkeypatch.undo()
+    monkeypatch.chdir(sweep.resolve().parents[2])
+    code, out, err = cli(*command)
+    assert code == 0, err
+    assert not (sweep / "data.shot.bins-5" / FAILED).exists()
+    assert [state for _, state, _ in states(sweep)] == 2 * ["finished"]
+
+
+def test_one_command_one_folder(monkeypatch):
+    def folder(*words):
+        monkeypatch.setattr(sys, "argv", ["src.train", *words])
+        return sweep_folder()
+
+    one = folder("-m", "seed=0,1", "+metric=true")
+    assert one == folder("--multirun", "seed=0,1", "+metric=true", "hydra.job.name=x")
+    assert one.startswith("seed-0-1_metric-true-")
+    assert one != folder("-m", "seed=0-1", "+metric=true")
+    assert folder("-m") == "sweep"
+
+
+@pytest.mark.parametrize("name", ["a/b", "a=b", "ü,*?", "x" * 500])
+def test_names_are_legal_and_their_own(name):
+    legal = legal_name(name)
+    assert len(legal) < 140 and not set(legal) & set("/=,*?\\ ")
+    assert legal != legal_name(name + "1")
