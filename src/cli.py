@@ -14,25 +14,20 @@ import hydra
 from hydra.core.hydra_config import HydraConfig
 from hydra.errors import HydraException
 from hydra.types import RunMode
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig
 from omegaconf.errors import OmegaConfBaseException
 
 from src.config import ConfigError
 from src.data.shapes import DataError
 from src.geometry.mesh import MeshError
 from src.runs import RunError, Stopped
-from src.sweeps import job_folder, note_failure, sweep_folder
+from src.sweeps import Table, announce, note_failure
 
 CONF = str(Path(__file__).parents[1] / "conf")
 USER_ERRORS = (ConfigError, DataError, MeshError, RunError, OSError, HydraException,
                OmegaConfBaseException)  # fmt: skip
 
 log = logging.getLogger("src")
-
-
-def run_folder(resume: str | None, new: str) -> str:
-    """Hydra's run folder: that of the run to go on with, if it is there."""
-    return resume if resume and Path(resume).is_dir() else new
 
 
 def entry_point(
@@ -69,9 +64,7 @@ def entry_point(
         def main() -> None:
             failed.clear()
             os.environ.setdefault("HYDRA_FULL_ERROR", "1")  # Hydra hands errors on: we word them
-            OmegaConf.register_new_resolver("run_folder", run_folder, replace=True)
-            OmegaConf.register_new_resolver("job_folder", job_folder, replace=True)
-            OmegaConf.register_new_resolver("sweep_folder", sweep_folder, replace=True)
+            announce()
             signal.signal(signal.SIGTERM, _stop)
             signal.signal(signal.SIGINT, _stop)
             try:
@@ -82,7 +75,7 @@ def entry_point(
             except USER_ERRORS as error:
                 print(f"error: {one_line(error)}", file=sys.stderr)
                 sys.exit(2 if isinstance(error, HydraException) else 1)
-            if failed:
+            if failed or Table.failed:
                 sys.exit(1)
 
         return main
@@ -101,7 +94,9 @@ def one_line(error: BaseException) -> str:
         for i, line in enumerate(lines):
             if line.startswith("Available options in"):
                 options = itertools.takewhile(lambda x: "search path" not in x, lines[i + 1 :])
-                return f"{lines[0]}; there are: {', '.join(options)}"
+                extra = "; others need pip install -e '.[parallel,cluster]'"
+                hint = extra if "hydra/launcher" in lines[0] else ""
+                return f"{lines[0]}; there are: {', '.join(options)}{hint}"
         cause = error.__cause__
         reason = f" ({str(cause).splitlines()[0]})" if cause is not None and str(cause) else ""
         return lines[0] + reason

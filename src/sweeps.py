@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import json
-import logging
+import os
 import re
 import sys
 from pathlib import Path
@@ -14,17 +14,29 @@ from typing import Any
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.errors import HydraException
 from hydra.experimental.callback import Callback
-from omegaconf import DictConfig
+from omegaconf import DictConfig, OmegaConf
 
 from src.runs import CONFIG, LAST, METRICS, write_whole
 
 FAILED = "failed.txt"  # in the folder of a job that failed: why, in a line
-log = logging.getLogger("src")
+COMMAND = "SPIRAL_COMMAND"  # in the environment: the words of the command line, for jobs elsewhere
+
+
+def announce() -> None:
+    """Have the jobs of this command line, in whatever process they run, know its words."""
+    os.environ[COMMAND] = json.dumps(sys.argv[1:])
+    Table.failed = 0
+
+
+def run_folder(resume: str | None, new: str) -> str:
+    """A run's folder: that of the run to go on with, if it is there."""
+    return resume if resume and Path(resume).is_dir() else new
 
 
 def sweep_folder() -> str:
     """A sweep's folder, named by its command line: the same command finds its jobs again."""
-    words = [word for word in sys.argv[1:] if not word.lstrip("+~").startswith(("-", "hydra."))]
+    words = json.loads(os.environ[COMMAND])
+    words = [word for word in words if not re.match(r"[+~]*(-|hydra[./])", word)]
     return legal_name("_".join(word.lstrip("+") for word in words).replace("=", "-")) or "sweep"
 
 
@@ -35,7 +47,7 @@ def job_folder(overrides: list[str], number: int) -> str:
     """
     parse = OverridesParser.create().parse_override
     fixed = set()
-    for word in sys.argv[1:]:
+    for word in json.loads(os.environ[COMMAND]):
         with contextlib.suppress(HydraException):
             override = parse(word)
             if not override.is_sweep_override():
@@ -77,12 +89,24 @@ def states(folder: Path) -> list[tuple[str, str, str]]:
 
 
 class Table(Callback):
-    """At the end of a sweep, by Hydra's leave: what finished, what failed, and why."""
+    """At the end of a sweep, by Hydra's leave: what finished, what failed, and why.
+
+    failed: how many did, in the latest sweep of this process.
+    """
+
+    failed = 0
 
     def on_multirun_end(self, config: DictConfig, **_: Any) -> None:
         folder = Path(config.hydra.sweep.dir)
         rows = states(folder)
+        Table.failed = sum(state == "failed" for _, state, _ in rows)
         widths = [max([len(row[i]) for row in rows] or [0]) for i in range(2)]
         lines = [f"  {job:<{widths[0]}}  {state:<{widths[1]}}  {what}" for job, state, what in rows]
         print("\n".join([f"\nSweep {folder}:", *lines]))
         print(f"To see them all: python -m src.report runs={folder}")
+
+
+# on import, since a launcher's processes import what their job needs, and no more
+OmegaConf.register_new_resolver("run_folder", run_folder, replace=True)
+OmegaConf.register_new_resolver("job_folder", job_folder, replace=True)
+OmegaConf.register_new_resolver("sweep_folder", sweep_folder, replace=True)

@@ -13,7 +13,7 @@ from hydra.core.global_hydra import GlobalHydra
 from omegaconf import OmegaConf
 
 from src.config import ConfigError
-from src.sweeps import job_folder
+from src.sweeps import announce, job_folder
 from src.train import main
 from tests.test_train import FIGURES, ROOT, composed
 
@@ -220,6 +220,7 @@ def test_jobs_never_share_a_folder(monkeypatch):
     """Also where a name had to lose what tells two of them apart."""
     values = ["[train/*.ply]", "[train/?.ply]", "/a/b", "a/b", "x" * 300, "x" * 301, "1", "2"]
     monkeypatch.setattr(sys, "argv", ["src.train", "-m", "seq_len=8", "data.root=1,2"])
+    announce()
     names = [job_folder(["seq_len=8", f"data.root={value}"], 0) for value in values]
     assert len(set(names)) == len(values)
     assert names[-2:] == ["data.root-1", "data.root-2"]

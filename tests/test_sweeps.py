@@ -9,10 +9,11 @@ import sys
 import time
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from src.runs import LAST, METRICS
-from src.sweeps import FAILED, legal_name, states, sweep_folder
+from src.sweeps import FAILED, announce, legal_name, states, sweep_folder
 from tests.test_cli import QUICK, cli  # noqa: F401
 from tests.test_train import ROOT, run, weights
 
@@ -81,6 +82,7 @@ def test_what_failed_is_in_the_table_and_tried_again(cli, toy_overrides, monkeyp
 def test_one_command_one_folder(monkeypatch):
     def folder(*words):
         monkeypatch.setattr(sys, "argv", ["src.train", *words])
+        announce()
         return sweep_folder()
 
     one = folder("-m", "seed=0,1", "+metric=true")
@@ -95,3 +97,28 @@ def test_names_are_legal_and_their_own(name):
     legal = legal_name(name)
     assert len(legal) < 140 and not set(legal) & set("/=,*?\\ ")
     assert legal != legal_name(name + "1")
+
+
+@pytest.mark.parametrize("launcher", ["joblib", "submitit_local"])
+def test_jobs_run_in_processes_of_their_own(toy_overrides, tmp_path, launcher):
+    """Several at a time, with one cache, each on its share of the cores; one fails."""
+    toy = [o for o in toy_overrides if not o.startswith(("trainer.threads", "optim"))]
+    command = ["-m", f"hydra/launcher={launcher}", "optim.lr=0,0.01,0.02", *toy, *QUICK]
+    env = {**os.environ, "PYTHONPATH": str(ROOT)}
+    done = subprocess.run([sys.executable, "-m", "src.train", *command], cwd=tmp_path, env=env,
+                          capture_output=True, text=True)  # fmt: skip
+    assert done.returncode == 1, done.stderr
+    [sweep] = (tmp_path / "outputs" / "sweeps").iterdir()
+    assert "launcher" not in sweep.name
+    found = {job: state for job, state, _ in states(sweep)}
+    assert found == {
+        "optim.lr-0": "failed",
+        "optim.lr-0.01": "finished",
+        "optim.lr-0.02": "finished",
+    }
+    assert "optim.lr must be above 0" in done.stdout
+    alone = tmp_path / "alone"
+    run(alone, [*toy, *QUICK, "optim.lr=0.01", "trainer.threads=1"])
+    kept, expected = weights(sweep / "optim.lr-0.01"), weights(alone)
+    for key, value in expected.items():
+        np.testing.assert_allclose(kept[key], value, atol=1e-4)

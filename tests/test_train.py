@@ -21,7 +21,7 @@ from omegaconf import OmegaConf
 
 from src import train as program
 from src.callbacks import Checkpoint, Looks, Speed, WholeFiles
-from src.cli import CONF, run_folder
+from src.cli import CONF
 from src.config import checked
 from src.correspondence import Correspondence
 from src.data.sources import open_data
@@ -37,7 +37,6 @@ FIGURES = {
 
 
 def composed(overrides):
-    OmegaConf.register_new_resolver("run_folder", run_folder, replace=True)
     with initialize_config_dir(CONF, version_base="1.3"):
         return checked(compose("train", overrides))
 
