@@ -42,7 +42,7 @@ from src.trainer import choose_precision, device_of
 
 log = logging.getLogger("src.benchmark")
 
-SHOT_RADIUS, PATCH_RADIUS = 0.16, 0.08  # as in conf/
+SHOT_RADIUS, PATCH_RADIUS = 0.16, 0.12  # as in conf/
 LARGE = (20_000, 100_000)  # vertices of a mesh and of a template that must fit into memory
 Row = dict[str, object]
 

@@ -11,8 +11,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from omegaconf import OmegaConf
 
-from src.runs import LAST, METRICS
+from src.runs import CONFIG, LAST, METRICS
 from src.sweeps import FAILED, announce, legal_name, states, sweep_folder
 from tests.test_cli import QUICK, cli  # noqa: F401
 from tests.test_train import ROOT, run, weights
@@ -122,3 +123,23 @@ def test_jobs_run_in_processes_of_their_own(toy_overrides, tmp_path, launcher):
     kept, expected = weights(sweep / "optim.lr-0.01"), weights(alone)
     for key, value in expected.items():
         np.testing.assert_allclose(kept[key], value, atol=1e-4)
+
+
+@pytest.mark.parametrize(
+    "name, jobs",
+    [
+        ("networks", {"model-fcs", "model-gcnn3", "model-lstm"}),
+        ("remeshed", {f"model-{m}_metric-{x}" for m in ("fcs", "lstm") for x in ("True", "False")}),
+        ("lengths", {f"model-{m}_seq_len-{n}_metric-{x}" for m in ("fcs", "lstm")
+                     for n in (15, 20, 30) for x in ("True", "False")}),
+    ],
+    ids=["networks", "remeshed", "lengths"],
+)  # fmt: skip
+def test_the_paper_s_experiments_are_sweeps(cli, toy_overrides, name, jobs):  # noqa: F811
+    toy = [o for o in toy_overrides if not o.startswith("seq_len")]
+    code, _, err = cli("-m", f"experiment={name}", *toy, *QUICK)
+    assert code == 0, err
+    [sweep] = Path("outputs/sweeps").iterdir()
+    assert {(job, state) for job, state, _ in states(sweep)} == {(job, "finished") for job in jobs}
+    lengths = {OmegaConf.load(sweep / job / CONFIG).seq_len for job in jobs}
+    assert lengths == ({15, 20, 30} if name == "lengths" else {30})
