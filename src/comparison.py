@@ -193,9 +193,14 @@ def varied(runs: list[Run]) -> list[str]:
     return sorted(found - fields - of_data)
 
 
+def other_settings(groups: list[Group]) -> list[str]:
+    """The settings without a field of their own in which some group differs from another."""
+    return sorted({key for group in groups for key, _ in group.others})
+
+
 def labelled(groups: list[Group], *without: str) -> dict[str, np.ndarray]:
     """Curves [R, T] by what tells the groups apart."""
-    for key in {key for group in groups for key, _ in group.others}:
+    for key in other_settings(groups):
         if len({json.dumps(dict(group.others).get(key)) for group in groups}) == 1:
             without += (key,)
     for field in ("data", "length"):
@@ -237,6 +242,6 @@ def plain(value: Any) -> str:
     """As a reader wants it."""
     if value is None:
         return "\u2013"
-    return (
-        {True: "yes", False: "no"}.get(value, str(value)) if isinstance(value, bool) else str(value)
-    )
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    return str(value)

@@ -15,7 +15,7 @@ from src.cli import entry_point
 from src.config import ConfigError, checked, typed
 from src.data.shapes import DataError
 from src.data.store import digest
-from src.runs import BEST, METRICS, RunError, read_checkpoint, write_whole
+from src.runs import BEST, RunError, read_checkpoint, write_metrics, write_whole
 
 KINDS = ("png", "pdf", "svg")  # of a figure
 OURS = ["errors.png", "correspondence.png",
@@ -115,7 +115,7 @@ def evaluate(config: DictConfig) -> Path:
             write_whole(folder / f"rotations.{kind}", encoded(figure, kind))
         for line in told(found):
             log.info(line)
-    write_whole(folder / METRICS, json.dumps(metrics, indent=2) + "\n")
+    write_metrics(folder, metrics)
     summary.draw(folder, {"test": curve}, outcome, data, chosen, KINDS)
     return folder
 

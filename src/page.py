@@ -12,7 +12,7 @@ import numpy as np
 from jinja2 import Environment, FileSystemLoader
 from plotly.offline import get_plotlyjs
 
-from src.comparison import FIGURES, Group, plain
+from src.comparison import FIGURES, Group, other_settings, plain
 from src.data.datamodule import CorrespondenceData
 from src.data.store import digest
 from src.evaluation import Outcome
@@ -31,7 +31,7 @@ def page(
                               trim_blocks=True, lstrip_blocks=True)  # fmt: skip
     columns, rows = run_table(groups)
     several = [group for group in groups if len(group.seeds) > 1]
-    others = sorted({key for group in groups for key, _ in group.others})
+    others = other_settings(groups)
     scale = (255 * ERROR_COLORS(np.linspace(0, 1, 256))[:, :3]).round().astype(int).tolist()
     data = json.dumps({"scenes": scenes.scenes, "surfaces": scenes.surfaces, "scale": scale})
     return environment.get_template("page.html").render(

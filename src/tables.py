@@ -8,12 +8,12 @@ from typing import Any
 
 import numpy as np
 
-from src.comparison import FIGURES, Group, plain
+from src.comparison import FIGURES, Group, other_settings, plain
 
 
 def run_table(groups: list[Group]) -> tuple[list[str], list[list[Any]]]:
     """Names of columns, and a row for each run."""
-    others = sorted({key for group in groups for key, _ in group.others})
+    others = other_settings(groups)
     columns = ["network", "N", "metric", "data", "seed", *others, *FIGURES.values(), "folder"]
     rows = []
     for group in groups:
@@ -37,7 +37,7 @@ def as_csv(columns: list[str], rows: list[list[Any]]) -> str:
 
 def as_tex(groups: list[Group]) -> str:
     """A table for booktabs: a row for each group, mean and spread where it has several seeds."""
-    others = sorted({key for group in groups for key, _ in group.others})
+    others = other_settings(groups)
     shown = [key for key in FIGURES if key.startswith("test/") or key == "parameters"]
     columns = ["network", "$N$", "metric", "data", *map(escaped, others),
                *(escaped(FIGURES[key]) for key in shown)]  # fmt: skip
