@@ -57,6 +57,7 @@ class Shot:
 class Remesh:
     policy: str = MISSING
     vertices: int = MISSING
+    copies: int = 1
 
 
 @dataclass
@@ -134,7 +135,8 @@ DATASETS = {"bodies": Bodies, "faust": Faust, "faust_benchmark": FaustBenchmark,
 
 AT_LEAST = {
     "seq_len": 1, "seed": 0, "optim.epochs": 1, "optim.warmup": 0, "data.workers": 1,
-    "data.shot.bins": 1, "data.remesh.vertices": 12, "model.rings": 1, "model.patch.rings": 1,
+    "data.shot.bins": 1, "data.remesh.vertices": 12, "data.remesh.copies": 1,
+    "model.rings": 1, "model.patch.rings": 1,
     "trainer.threads": 1, "trainer.val_every": 1,
 }  # fmt: skip
 ABOVE_ZERO = ("optim.lr", "data.shot.radius", "model.feature_scale", "model.patch.radius")

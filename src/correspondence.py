@@ -15,7 +15,7 @@ from src.evaluation import Result, result_of
 from src.metrics import CorrespondenceError
 from src.nn.geodesic import Resampling
 from src.nn.layers import metric_features
-from src.nn.loss import linear_cross_entropy, predict
+from src.nn.loss import Prediction, linear_cross_entropy, predict
 from src.nn.networks import GCNN3, FCSNet, LSTMNet
 
 
@@ -82,15 +82,15 @@ class Correspondence(L.LightningModule):
     def test_step(self, batch: Batch, batch_idx: int) -> None:
         self._evaluate("test", batch)
 
-    def predict(self, batch: Batch) -> tuple[np.ndarray, Tensor]:
-        """int64 [V], the vertex of the template that each vertex gets; and the mean loss."""
-        x, head = self.embed(batch), self.net.head
-        predicted, loss = predict(x, head.weight, head.bias, batch["labels"])
-        return predicted.cpu().numpy(), loss
+    def predict(self, batch: Batch) -> Prediction:
+        """The vertex of the template that each vertex gets. Without labels there is no loss."""
+        head = self.net.head
+        return predict(self.embed(batch), head.weight, head.bias, batch.get("labels"))
 
     def _evaluate(self, split: str, batch: Batch) -> None:
-        predicted, loss = self.predict(batch)
-        self.log(f"{split}/loss", loss, batch_size=1, sync_dist=True)
+        found = self.predict(batch)
+        predicted = found.classes.cpu().numpy()
+        self.log(f"{split}/loss", found.loss, batch_size=1, sync_dist=True)
         result = result_of(predicted, batch, self.distances)
         self.results[split][batch["index"]] = result
         self.errors[split].update(result.errors, predicted == batch["labels"].cpu().numpy())
@@ -121,7 +121,12 @@ class Correspondence(L.LightningModule):
             self.results[split] = {i: mesh for share in shares for i, mesh in share.items()}
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        checkpoint["template"] = self.trainer.datamodule.template_key
+        data = self.trainer.datamodule
+        template = data.shapes.template
+        checkpoint["template"] = {"vertices": torch.from_numpy(template.vertices),
+                                  "faces": torch.from_numpy(template.faces)}  # fmt: skip
+        checkpoint["up"] = data.shapes.up
+        checkpoint["resolution"] = data.resolution
         if "val" in self.curves:
             checkpoint["validation"] = (self.figures["val"], torch.from_numpy(self.curves["val"]))
 

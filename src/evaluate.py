@@ -139,7 +139,10 @@ def place(data: dict[str, Any], trained: dict[str, Any], asked: dict[str, Any]) 
 
 def opened(settings: dict[str, Any], saved: dict[str, Any], asked: dict[str, Any]):
     """The data with its test shapes ready. Errors: RunError if its labels mean another template."""
+    import numpy as np
+
     from src.data.sources import open_data
+    from src.predictor import template_of
 
     try:
         data = open_data(settings)
@@ -147,7 +150,9 @@ def opened(settings: dict[str, Any], saved: dict[str, Any], asked: dict[str, Any
         if "name" in asked:
             raise
         raise DataError(f"{error}; if the data set has moved: data.root=") from error
-    if saved.get("template") != data.template_key:
+    template = template_of(saved)
+    same = np.array_equal(template.vertices, data.shapes.template.vertices)
+    if not (same and np.array_equal(template.faces, data.shapes.template.faces)):
         classes = saved["hyper_parameters"]["num_classes"]
         raise RunError(
             f"the labels of {settings['data']['name']} mean the {data.num_classes} vertices of "
@@ -159,38 +164,15 @@ def opened(settings: dict[str, Any], saved: dict[str, Any], asked: dict[str, Any
 
 def predictor(saved: dict[str, Any], settings: dict[str, Any], accelerator: str):
     """A trained network: predict(data, i, purpose) tests mesh i of the data's test set, with
-    spirals drawn for that purpose.
-
-    saved: of `read_checkpoint`. settings: its whole config, in plain containers.
-    """
-    import torch
-
-    from src.correspondence import Correspondence
-    from src.data.datamodule import rotate
+    spirals drawn for that purpose. Arguments: as for `Predictor`."""
     from src.evaluation import result_of
-    from src.trainer import choose_precision, device_of
+    from src.predictor import Predictor
 
-    device = device_of(accelerator)
-    precision = choose_precision(settings["trainer"]["precision"], accelerator)
-    sizes = (saved["hyper_parameters"][key] for key in ("in_features", "num_classes"))
-    module = Correspondence(settings, *sizes)
-    try:
-        module.load_state_dict(saved["state_dict"])
-    except RuntimeError as error:
-        raise RunError("the checkpoint's weights are not those of its config") from error
-    module.to(device, torch.float64 if precision == "64-true" else torch.float32).eval()
+    network = Predictor(saved, settings, accelerator)
 
     def predict(data, i: int, purpose: str):
         batch = data.datasets["test"][i]
-        batch = module.transfer_batch_to_device(batch, torch.device(device), 0)
-        batch = rotate(batch, settings["seed"], "spirals", purpose)
-        if precision == "64-true":
-            batch = {key: value.double() if key in ("features", "vertices", "unit") else value
-                     for key, value in batch.items()}  # fmt: skip
-        with torch.inference_mode(), torch.autocast(device, torch.bfloat16,
-                                                    enabled=precision == "bf16-mixed"):  # fmt: skip
-            predicted, _ = module.predict(batch)
-        return result_of(predicted, batch, data.reference)
+        return result_of(network(batch, purpose).classes.cpu().numpy(), batch, data.reference)
 
     return predict
 

@@ -100,8 +100,14 @@ def template_colors(template: Mesh) -> np.ndarray:
 
     Equal colours on two shapes mean: the same place of the template.
     """
+    return place_colors(template, template.vertices)
+
+
+def place_colors(template: Mesh, points: np.ndarray) -> np.ndarray:
+    """The same for points [V, 3] on the template; grey where they are NaN."""
     low, high = template.vertices.min(axis=0), template.vertices.max(axis=0)
-    return 0.1 + 0.9 * (template.vertices - low) / np.maximum(high - low, 1e-12)
+    colors = 0.1 + 0.9 * (points - low) / np.maximum(high - low, 1e-12)
+    return np.where(np.isnan(colors), 0.6, colors.clip(0, 1))
 
 
 def error_colors(errors: np.ndarray) -> np.ndarray:
@@ -109,30 +115,41 @@ def error_colors(errors: np.ndarray) -> np.ndarray:
     return ERROR_COLORS(np.asarray(errors) / MOST_ERROR)[:, :3]
 
 
-def picture_figure(
-    images: list[np.ndarray], middles: np.ndarray, captions: list[str], error_bar: bool = False
-) -> Figure:
-    """Views of a row of meshes, one below the other, with captions, and the colours of errors.
+def confidence_colors(confidence: np.ndarray) -> np.ndarray:
+    """float [V, 3] in 0..1: from dark, a confidence of 0, to pale, 1."""
+    return ERROR_COLORS(1 - np.asarray(confidence))[:, :3]
 
-    images, middles: a `src.render.Picture`.
+
+def picture_figure(
+    images: list[np.ndarray], middles: np.ndarray, captions: list[str], bar: str | None = None
+) -> Figure:
+    """Views of a row of meshes, one below the other, with captions, and the colours' meaning.
+
+    images, middles: a `src.render.Picture`. bar: what the colours show, "error" or "confidence".
     """
     height, width = images[0].shape[:2]
     inches = width / DPI
-    bar = 0.9 if error_bar else 0.0
-    figure = Figure(figsize=(inches + bar, (height / DPI) * len(images) + 0.25))
+    margin = 0.9 if bar else 0.0
+    figure = Figure(figsize=(inches + margin, (height / DPI) * len(images) + 0.25))
     figure.set_dpi(DPI)
     tall = figure.get_figheight()
     share = height / DPI / tall
     for row, image in enumerate(images):
-        axes = figure.add_axes((0, 1 - (row + 1) * share, inches / (inches + bar), share))
+        axes = figure.add_axes((0, 1 - (row + 1) * share, inches / (inches + margin), share))
         axes.imshow(image)
         axes.axis("off")
     for middle, caption in zip(middles, captions, strict=True):
-        figure.text(middle * inches / (inches + bar), 0.08 / tall, caption, ha="center", fontsize=8)
-    if error_bar:
-        axes = figure.add_axes((inches / (inches + bar), 0.2, 0.12 / (inches + bar), 0.6))
-        scale = ScalarMappable(Normalize(0, MOST_ERROR), ERROR_COLORS)
-        figure.colorbar(scale, cax=axes, extend="max", label=ERROR_LABEL)
+        figure.text(
+            middle * inches / (inches + margin), 0.08 / tall, caption, ha="center", fontsize=8
+        )
+    if bar:
+        axes = figure.add_axes((inches / (inches + margin), 0.2, 0.12 / (inches + margin), 0.6))
+        if bar == "error":
+            scale = ScalarMappable(Normalize(0, MOST_ERROR), ERROR_COLORS)
+            figure.colorbar(scale, cax=axes, extend="max", label=ERROR_LABEL)
+        else:
+            scale = ScalarMappable(Normalize(0, 1), ERROR_COLORS.reversed())
+            figure.colorbar(scale, cax=axes, label=bar)
     return figure
 
 

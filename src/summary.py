@@ -65,7 +65,7 @@ def draw(
         log.warning("no pictures of the shapes: %s", error)
         return
     figures = {"correspondence.png": picture_figure(*drawn[0], ["template", *chosen]),
-               "errors.png": picture_figure(*drawn[1], chosen, error_bar=True)}  # fmt: skip
+               "errors.png": picture_figure(*drawn[1], chosen, bar="error")}  # fmt: skip
     for name, picture in figures.items():
         write_whole(folder / name, encoded(picture, "png"))
 

@@ -21,7 +21,8 @@ from src.memory import keep_freed_memory
 def build_trainer(config: DictConfig, folder: Path, *callbacks: Callback) -> L.Trainer:
     """A trainer that logs to, and keeps its checkpoints in, a run folder.
 
-    best.ckpt is that of the least mean geodesic error on validation, last.ckpt of the last epoch.
+    best.ckpt holds the weights with the least mean geodesic error on validation, last.ckpt all that
+    the run needs to go on.
     Errors: ConfigError for a device that this machine lacks.
     """
     quiet()
@@ -53,7 +54,9 @@ def build_trainer(config: DictConfig, folder: Path, *callbacks: Callback) -> L.T
                 Looks(),
                 OrderlyStop(folder),
                 LearningRateMonitor("step"),
-                Checkpoint(filename="best", monitor="val/geodesic_error", **keep),
+                Checkpoint(
+                    filename="best", monitor="val/geodesic_error", save_weights_only=True, **keep
+                ),
                 Checkpoint(filename="last", save_on_train_epoch_end=True, **keep),
                 *callbacks,
             ],

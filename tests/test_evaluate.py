@@ -19,6 +19,7 @@ from src.evaluate import main, merged
 from src.evaluation import ERRORS, Outcome, Result, evenly, result_of, rotations
 from src.figures import all_curves_figure, curve_figure, encoded, error_colors
 from src.metrics import THRESHOLDS, point_errors
+from src.predictor import template_of
 from src.runs import BEST, METRICS, RunError
 from tests.conftest import toy_shapes
 from tests.test_cli import cli  # noqa: F401
@@ -329,4 +330,6 @@ def test_curves_of_several_runs_have_a_band():
 
 def test_a_checkpoint_knows_its_template(trained):
     saved = torch.load(trained[0] / BEST, weights_only=True)
-    assert len(saved["template"]) == 64
+    faces = toy_shapes()["template.ply"].faces
+    np.testing.assert_array_equal(template_of(saved).faces, faces)
+    assert saved["resolution"] > 0 and "optimizer_states" not in saved

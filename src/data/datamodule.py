@@ -15,7 +15,6 @@ from tqdm import tqdm
 
 from src.data.preprocessing import (
     Recipe,
-    Task,
     by_rows_and_columns,
     descriptor_task,
     load_task,
@@ -24,7 +23,8 @@ from src.data.preprocessing import (
 )
 from src.data.reference import ReferenceDistances
 from src.data.shapes import SPLITS, DataError, Shape, ShapeSet
-from src.data.store import Store, digest
+from src.data.store import Arrays, Store, digest
+from src.geometry.mesh import Mesh
 
 log = logging.getLogger(__name__)
 
@@ -62,6 +62,22 @@ def rotate(batch: Batch, *purpose: int | str) -> Batch:
     generator.manual_seed(derived_seed(*purpose, batch["index"]))
     batch["spirals"] = draw_spirals(sequences, first, generator)
     return batch
+
+
+def described_tensors(arrays: Arrays, mesh: Mesh, recipe: Recipe) -> Batch:
+    """`features`, `vertices` and `unit` of `MeshDataset`; arrays: of a `descriptor_task`."""
+    return {
+        "features": torch.from_numpy(arrays["features"]),
+        "vertices": torch.from_numpy(mesh.vertices.astype(np.float32)),
+        "unit": torch.tensor(recipe.shot_radius * np.sqrt(mesh.area), dtype=torch.float32),
+    }
+
+
+def neighbourhood_tensors(arrays: Arrays, mesh: Mesh, recipe: Recipe) -> Batch:
+    """The neighbourhoods of `MeshDataset`; arrays: of a `neighbourhood_task`."""
+    if recipe.patch is None:
+        return _tensors(arrays)
+    return {"patches": _tensors(by_rows_and_columns(arrays, len(mesh.vertices)))}
 
 
 class MeshDataset(Dataset):
@@ -141,9 +157,9 @@ class CorrespondenceData(L.LightningDataModule):
         return len(self.shapes.template.vertices)
 
     @property
-    def template_key(self) -> str:
-        """The same for two data sets whose labels mean the same."""
-        return digest(self.shapes.template.vertices, self.shapes.template.faces)
+    def resolution(self) -> int:
+        """The number of vertices of a training mesh, the median."""
+        return int(np.median([len(item["labels"]) for item in self.datasets["train"].items]))
 
     @property
     def in_features(self) -> int:
@@ -189,27 +205,20 @@ class CorrespondenceData(L.LightningDataModule):
                         desc="Loading", unit="mesh", delay=1.0)  # fmt: skip
         for (split, name), shape, (descriptors, neighbourhoods) in progress:
             if neighbourhoods.key not in loaded:
-                loaded[neighbourhoods.key] = self._neighbourhoods(neighbourhoods, shape)
-            item = _tensors(load_task(descriptors, self.store)) | loaded[neighbourhoods.key]
-            if undefined := int(item.pop("undefined")):
+                arrays = load_task(neighbourhoods, self.store)
+                loaded[neighbourhoods.key] = neighbourhood_tensors(arrays, shape.mesh, self.recipe)
+            described = load_task(descriptors, self.store)
+            if undefined := int(described["undefined"]):
                 log.warning("%s: no descriptor at %d of %d vertices; zeros stand there",
                             name, undefined, len(shape.labels))  # fmt: skip
+            item = described_tensors(described, shape.mesh, self.recipe)
+            item |= loaded[neighbourhoods.key]
             item["labels"] = torch.from_numpy(shape.labels)
             if shape.points is not None:
                 item |= _tensors(shape.points._asdict())
-            item["vertices"] = torch.from_numpy(shape.mesh.vertices.astype(np.float32))
-            item["unit"] = torch.tensor(
-                self.recipe.shot_radius * np.sqrt(shape.mesh.area), dtype=torch.float32
-            )
             items[split].append(item)
         for split in wanted:
             self.datasets[split] = MeshDataset(self.shapes.names[split], items[split])
-
-    def _neighbourhoods(self, task: Task, shape: Shape) -> Batch:
-        arrays = load_task(task, self.store)
-        if self.recipe.patch is None:
-            return _tensors(arrays)
-        return {"patches": _tensors(by_rows_and_columns(arrays, len(shape.labels)))}
 
     def train_dataloader(self) -> DataLoader:
         skip, self._skip = self._skip, 0

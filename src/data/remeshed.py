@@ -20,11 +20,18 @@ class Remeshed(ShapeSet):
     Its template, names and split are those of the other set. The truth of a vertex is a point of
     the template: the one that its closest point on the original shape stands for; its label is the
     nearest corner of that face. policy, vertices: as `src.geometry.remesh.remesh` takes them; the
-    seed is drawn from the shape's content. Errors: DataError without PyMeshLab.
+    seed is drawn from the shape's content. copies: so many tessellations of each training shape.
+    Errors: DataError without PyMeshLab.
     """
 
     def __init__(
-        self, base: ShapeSet, store: Store, workers: int | None, policy: str, vertices: int
+        self,
+        base: ShapeSet,
+        store: Store,
+        workers: int | None,
+        policy: str,
+        vertices: int,
+        copies: int = 1,
     ) -> None:
         try:
             self._version = version("pymeshlab")
@@ -32,16 +39,19 @@ class Remeshed(ShapeSet):
             raise DataError("remeshing needs PyMeshLab: pip install -e '.[remesh]'") from error
         self._base, self._store, self._workers = base, store, workers
         self._policy, self._vertices = policy, vertices
-        self.template, self.names, self.up = base.template, base.names, base.up
+        self.template, self.up = base.template, base.up
+        once, further = base.names["train"], range(2, copies + 1)
+        self._copies = {f"{name}~{copy}": (name, copy) for copy in further for name in once}
+        self.names = {**base.names, "train": [*once, *self._copies]}
 
     def prepare(self, names: list[str]) -> None:
-        self._base.prepare(names)
-        tasks = [self._task(self._base.load(name).mesh) for name in names]
+        self._base.prepare(sorted({self._of(name)[0] for name in names}))
+        tasks = [self._task(self.source(name).mesh, self._of(name)[1]) for name in names]
         run_tasks(tasks, self._store, self._workers, "Remeshing")
 
     def load(self, name: str) -> Shape:
         source = self.source(name)
-        kept = load_task(self._task(source.mesh), self._store)
+        kept = load_task(self._task(source.mesh, self._of(name)[1]), self._store)
         corners = source.labels[source.mesh.faces[kept["face"]]]
         shape = Mesh(kept["vertices"], kept["faces"], source.mesh.name)
         place = self.template.vertices
@@ -53,10 +63,14 @@ class Remeshed(ShapeSet):
 
     def source(self, name: str) -> Shape:
         """The shape that the one of that name was made from."""
-        return self._base.load(name)
+        return self._base.load(self._of(name)[0])
 
-    def _task(self, source: Mesh) -> Task:
-        what = source.vertices, source.faces, self._policy
+    def _of(self, name: str) -> tuple[str, int]:
+        """The name of the shape in the other set, and which of its copies that is."""
+        return self._copies.get(name, (name, 1))
+
+    def _task(self, source: Mesh, copy: int) -> Task:
+        what = (source.vertices, source.faces, self._policy, *([copy] if copy > 1 else []))
         code = code_version(remesh, meshes)
         key = digest(*what, self._vertices, code, self._version)
         seed = int(digest(*what)[:15], 16)

@@ -28,17 +28,21 @@ def open_shapes(data: dict[str, Any]) -> ShapeSet:
     return shapes
 
 
-def open_data(config: dict[str, Any]) -> CorrespondenceData:
-    """The data module that a whole config describes, in plain containers. Errors: as above."""
-    data, model = config["data"], config["model"]
-    shot = data["shot"]
+def recipe_of(config: dict[str, Any]) -> Recipe:
+    """What the network that a whole config describes needs of each mesh."""
+    model, shot = config["model"], config["data"]["shot"]
     if "patch" in model:
         neighbourhood = {"patch": PatchRecipe(**model["patch"])}
     elif model.get("rings"):
         neighbourhood = {"rings": model["rings"]}
     else:
         neighbourhood = {"seq_len": config["seq_len"]}
-    recipe = Recipe(shot["radius"], shot["bins"], **neighbourhood)
+    return Recipe(shot["radius"], shot["bins"], **neighbourhood)
+
+
+def open_data(config: dict[str, Any]) -> CorrespondenceData:
+    """The data module that a whole config describes, in plain containers. Errors: as above."""
+    data = config["data"]
     store = Store(data["cache_dir"])
-    return CorrespondenceData(open_shapes(data), recipe, store, config["seed"],
+    return CorrespondenceData(open_shapes(data), recipe_of(config), store, config["seed"],
                               data["shuffle_vertices"], data["workers"])  # fmt: skip

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-SUFFIXES = (".ply", ".obj", ".off", ".stl")
+SUFFIXES = (".ply", ".obj", ".off", ".stl", ".glb")
 
 
 class MeshError(ValueError):
@@ -119,15 +119,29 @@ def _refuse(name, bad, rows, what, rule, number=True, shown=3):
 
 
 def read_mesh(path: str | Path) -> Mesh:
-    """Read a triangle mesh from a PLY, OBJ, OFF or STL file.
+    """Read a triangle mesh from a PLY, OBJ, OFF, STL or GLB file.
 
     Vertices keep the file's order and number, also those that no face names; polygons are
     triangulated. An OBJ's texture coordinates, normals, groups and materials are left aside, since
     they would split vertices. STL has no vertices, only the corners of triangles: corners at equal
-    coordinates become one vertex, numbered as they first appear.
+    coordinates become one vertex, numbered as they first appear. The parts of a GLB's scene become
+    one mesh, each in its place, one after the other.
 
     Errors: MeshError, with the path, for a file that is missing, unreadable, empty, of another
     format, a point cloud, or that fails the checks of `Mesh`.
+    """
+    return Mesh(*read_arrays(path), str(path))
+
+
+def parse_mesh(data: bytes, suffix: str, name: str) -> Mesh:
+    """`read_mesh` for the bytes of a file already in memory, say out of an archive."""
+    return Mesh(*parse_arrays(data, suffix, name), name)
+
+
+def read_arrays(path: str | Path) -> tuple[np.ndarray, np.ndarray]:
+    """Vertices [V, 3] and faces [F, 3] as they are in a file, without the checks of `Mesh`.
+
+    Errors: MeshError for a file that `read_mesh` could not read either.
     """
     path = Path(path)
     suffix = path.suffix.lower()
@@ -137,11 +151,11 @@ def read_mesh(path: str | Path) -> Mesh:
         data = path.read_bytes()
     except OSError as error:
         raise MeshError(f"{path}: {error.strerror or error}") from error
-    return parse_mesh(data, suffix, str(path))
+    return parse_arrays(data, suffix, str(path))
 
 
-def parse_mesh(data: bytes, suffix: str, name: str) -> Mesh:
-    """`read_mesh` for the bytes of a file already in memory, say out of an archive."""
+def parse_arrays(data: bytes, suffix: str, name: str) -> tuple[np.ndarray, np.ndarray]:
+    """`read_arrays` for the bytes of a file already in memory."""
     import trimesh  # slow to import, and not needed by a run whose tensors are all on disk
 
     if not data:
@@ -151,21 +165,40 @@ def parse_mesh(data: bytes, suffix: str, name: str) -> Mesh:
             data = _only_vertices_and_faces(data)
         loaded = trimesh.load(io.BytesIO(data), file_type=suffix[1:], process=False,
                               maintain_order=True)  # fmt: skip
-        if isinstance(loaded, trimesh.Scene):
-            parts = list(loaded.geometry.values())
-            loaded = parts[0] if len(parts) == 1 else None
+        parts = _parts(loaded)
     except Exception as error:  # whatever a parser raises on a damaged file
-        raise MeshError(f"{name}: not a readable {suffix[1:].upper()} file ({error})") from error
-    if not isinstance(loaded, trimesh.Trimesh) or len(loaded.faces) == 0:
+        reason = (str(error).splitlines() or [type(error).__name__])[0][:200]
+        raise MeshError(f"{name}: not a readable {suffix[1:].upper()} file ({reason})") from error
+    if not parts:
         raise MeshError(f"{name}: the file holds no triangle mesh (no faces)")
-    vertices, faces = np.asarray(loaded.vertices), np.asarray(loaded.faces)
+    first = np.cumsum([0, *(len(vertices) for vertices, _ in parts)])
+    vertices = np.concatenate([vertices for vertices, _ in parts])
+    faces = np.concatenate([faces + start for (_, faces), start in zip(parts, first, strict=False)])
     if suffix == ".stl":
         _, first, inverse = np.unique(vertices, axis=0, return_index=True, return_inverse=True)
         order = np.argsort(first)
         rank = np.empty_like(order)
         rank[order] = np.arange(len(order))
         vertices, faces = vertices[first[order]], rank[inverse.reshape(-1)][faces]
-    return Mesh(vertices, faces, name)
+    return vertices, faces
+
+
+def _parts(loaded) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Vertices and faces of each triangle mesh in what trimesh has read, in its place."""
+    if not hasattr(loaded, "geometry"):
+        found = [(loaded, None)]
+    else:
+        places = [loaded.graph[node] for node in sorted(loaded.graph.nodes_geometry)]
+        found = [(loaded.geometry[name], matrix) for matrix, name in places]
+    parts = []
+    for mesh, matrix in found:
+        faces = np.asarray(getattr(mesh, "faces", []))
+        if len(faces):
+            vertices = np.asarray(mesh.vertices, dtype=np.float64)
+            if matrix is not None and not np.array_equal(matrix, np.eye(4)):
+                vertices = vertices @ matrix[:3, :3].T + matrix[:3, 3]
+            parts.append((vertices, faces))
+    return parts
 
 
 def _only_vertices_and_faces(obj: bytes) -> bytes:

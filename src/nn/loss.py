@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import torch
 from torch import Tensor
 
@@ -62,21 +64,33 @@ class _LinearCrossEntropy(torch.autograd.Function):
                   for g in ctx.saved_tensors), None)  # fmt: skip
 
 
+class Prediction(NamedTuple):
+    """classes int64 [V], of the largest score; probability float [V], the softmax of that score;
+    loss, as `linear_cross_entropy` gives it, or None without labels."""
+
+    classes: Tensor
+    probability: Tensor
+    loss: Tensor | None
+
+
 @torch.no_grad()
-def predict(x: Tensor, weight: Tensor, bias: Tensor, labels: Tensor) -> tuple[Tensor, Tensor]:
-    """int64 [V]: the class with the largest score x weight^T + bias; and the loss, as above.
+def predict(x: Tensor, weight: Tensor, bias: Tensor, labels: Tensor | None = None) -> Prediction:
+    """The class with the largest score x weight^T + bias. Arguments as above.
 
     Never in bf16: among its 8 bits many scores would tie, and the first class win.
     """
-    classes = torch.empty_like(labels)
-    loss = torch.zeros((), dtype=weight.dtype, device=x.device)
+    classes = torch.empty(len(x), dtype=torch.int64, device=x.device)
+    probability = torch.empty(len(x), dtype=weight.dtype, device=x.device)
+    loss = None if labels is None else torch.zeros((), dtype=weight.dtype, device=x.device)
     with torch.autocast(x.device.type, enabled=False):
         for start in range(0, len(x), ROWS):
             rows = slice(start, start + ROWS)
             scores = torch.addmm(bias, x[rows].to(weight.dtype), weight.T)
             best = torch.argmax(scores, dim=1, keepdim=True)
-            right = scores.gather(1, labels[rows, None])
-            largest = scores.gather(1, best)
-            loss += (scores.sub_(largest).exp_().sum(1, keepdim=True).log() + largest - right).sum()
-            classes[rows] = best[:, 0]
-    return classes, loss / len(x)
+            scores -= scores.gather(1, best)
+            right = None if labels is None else scores.gather(1, labels[rows, None])
+            sums = scores.exp_().sum(1, keepdim=True)
+            if right is not None:
+                loss += (sums.log() - right).sum()
+            classes[rows], probability[rows] = best[:, 0], 1 / sums[:, 0]
+    return Prediction(classes, probability, None if loss is None else loss / len(x))

@@ -1,0 +1,103 @@
+"""What a mesh file says of its vertices beside their place: colours, texture coordinates."""
+
+from __future__ import annotations
+
+import io
+from pathlib import Path
+
+import numpy as np
+
+from src.data.shapes import DataError
+from src.geometry.mesh import read_arrays
+
+KINDS = ("color", "uv")
+
+
+def read_attribute(path: str | Path, what: str, vertices: int) -> np.ndarray:
+    """Of a mesh file with so many vertices: "color", uint8 [V, 3], or "uv", float64 [V, 2]; or of
+    another file, `what`, an array [V, ...] of numbers in .npy format.
+
+    Where an OBJ has several texture coordinates for one vertex, at a seam, the first counts.
+    Errors: DataError if the file has no such thing, or not for each vertex; MeshError as for
+    `read_mesh`.
+    """
+    path = Path(path)
+    if what not in KINDS:
+        values = _array(Path(what))
+    elif path.suffix.lower() == ".obj":
+        values = _of_obj(path, what)
+    else:
+        values = _of_parts(path, what)
+    if values is None or (what in KINDS and len(values) == 0):
+        raise DataError(f"{path}: its vertices have no {what}, so there is none to transfer")
+    if len(values) != vertices:
+        raise DataError(f"{path if what in KINDS else what}: {len(values)} values of {what} for "
+                        f"{vertices} vertices")  # fmt: skip
+    return values
+
+
+def _array(path: Path) -> np.ndarray:
+    if path.suffix != ".npy":
+        raise DataError(f"transfer must be {', '.join(KINDS)}, or a .npy file; got {path}")
+    try:
+        values = np.load(path, allow_pickle=False)
+    except (OSError, ValueError, EOFError) as error:
+        raise DataError(f"{path}: no array that can be read ({error})") from error
+    if not isinstance(values, np.ndarray) or values.ndim == 0 or values.dtype.kind not in "biufc":
+        raise DataError(f"{path}: holds no numbers for vertices")
+    return values
+
+
+def _of_parts(path: Path, what: str) -> np.ndarray | None:
+    import trimesh
+
+    read_arrays(path)  # says what is wrong with the file
+    loaded = trimesh.load(io.BytesIO(path.read_bytes()), file_type=path.suffix.lower()[1:],
+                          process=False, maintain_order=True)  # fmt: skip
+    parts = [loaded]
+    if hasattr(loaded, "geometry"):  # in the order of `read_arrays`
+        names = [loaded.graph[node][1] for node in sorted(loaded.graph.nodes_geometry)]
+        parts = [loaded.geometry[name] for name in names]
+    values = [_visual(part.visual, what) for part in parts if len(getattr(part, "faces", []))]
+    return None if any(value is None for value in values) else np.concatenate(values)
+
+
+def _visual(visual, what: str) -> np.ndarray | None:
+    if what == "uv":
+        return getattr(visual, "uv", None)
+    if visual.kind == "texture" and visual.uv is not None:
+        visual = visual.to_color()
+    return visual.vertex_colors[:, :3] if visual.kind == "vertex" else None
+
+
+def _of_obj(path: Path, what: str) -> np.ndarray | None:
+    vertices: list[list[str]] = []
+    textures: list[list[str]] = []
+    first: dict[int, int] = {}
+    try:
+        for line in path.read_text(encoding="utf-8", errors="replace").splitlines():
+            kind, *words = line.split() or [""]
+            if kind == "v":
+                vertices.append(words)
+            elif kind == "vt":
+                textures.append(words[:2])
+            elif kind == "f":
+                for corner in words:
+                    one, texture = [*corner.split("/"), ""][:2]
+                    if texture:
+                        first.setdefault(_number(one, vertices), _number(texture, textures))
+        if what == "color":
+            if not all(len(vertex) >= 6 for vertex in vertices):
+                return None
+            values = np.array([vertex[3:6] for vertex in vertices], dtype=float)
+            return np.round(255 * values.clip(0, 1)).astype(np.uint8)
+        values = np.full((len(vertices), 2), np.nan)
+        values[list(first)] = np.array(textures, dtype=float)[list(first.values())]
+        return values if first else None
+    except (ValueError, IndexError, OSError) as error:
+        raise DataError(f"{path}: its {what} can't be read ({error})") from error
+
+
+def _number(word: str, things: list) -> int:
+    number = int(word)
+    return number - 1 if number > 0 else len(things) + number

@@ -1,0 +1,137 @@
+"""Making a usable mesh of a damaged one, with a record of what was changed."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+import trimesh
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+
+from src.geometry.mesh import Mesh, MeshError
+from src.geometry.resample import without_repeats
+
+
+class Repaired(NamedTuple):
+    """A mesh; place int64 [V], for every vertex as it was one of the mesh, or -1; and what was
+    changed, in words."""
+
+    mesh: Mesh
+    place: np.ndarray
+    changes: list[str]
+
+
+def repair(vertices: np.ndarray, faces: np.ndarray, name: str) -> Repaired:
+    """A mesh that `Mesh` accepts, of arrays that it may refuse.
+
+    vertices: float [V, 3]. faces: int [F, 3]. In this order: faces go that name a vertex that is
+    not there or not finite, or one vertex twice, and faces that repeat another; vertices at one
+    place become one, faces without area by that go too; the surface is cut open along edges with
+    more than two faces; faces are turned to agree with their neighbours, and along edges where they
+    can't the surface is cut open as well. Holes stay. Errors: MeshError if no face is left.
+    """
+    vertices = np.array(vertices, dtype=np.float64)
+    faces = np.array(faces, dtype=np.int64).reshape(-1, 3)
+    changes: list[str] = []
+
+    def note(count: int, what: str) -> None:
+        if count:
+            changes.append(f"{count:,} {what}")
+
+    finite = np.isfinite(vertices).all(axis=1)
+    inside = ((faces >= 0) & (faces < len(vertices))).all(axis=1)
+    faces = faces[inside]
+    sound = finite[faces].all(axis=1)
+    note(int((~finite).sum()), "vertices with coordinates that are not finite left out")
+    note(int((~inside).sum()), "faces naming vertices that are not there left out")
+    note(int((~sound).sum()), "faces at vertices that are not finite left out")
+    faces, place = faces[sound], np.where(finite, np.arange(len(vertices)), -1)
+    before = len(faces)
+    faces = without_repeats(faces)
+    note(before - len(faces), "faces left out that named a vertex twice or repeated another")
+
+    kept = np.flatnonzero(finite)
+    _, first, inverse = np.unique(vertices[kept] + 0.0, axis=0, return_index=True,
+                                  return_inverse=True)  # fmt: skip
+    one = np.arange(len(vertices))
+    one[kept] = kept[first[inverse.reshape(-1)]]
+    note(int((one != np.arange(len(vertices))).sum()), "vertices joined with others at their place")
+    place[kept] = one[kept]
+    before = len(faces)
+    faces = without_repeats(one[faces])
+    note(before - len(faces), "faces left out that then were nothing or repeated another")
+    if not len(faces):
+        raise MeshError(f"{name}: no face that can be used")
+
+    vertices[~finite] = 0.0
+    vertices, faces, origin, cuts = cut_open(vertices, faces, crowded(faces))
+    note(cuts, "edges with more than two faces cut open")
+    wound = trimesh.Trimesh(vertices, faces, process=False)
+    trimesh.repair.fix_winding(wound)
+    turned = np.asarray(wound.faces, dtype=np.int64)
+    note(int((turned != faces).any(axis=1).sum()), "faces turned to agree with their neighbours")
+    vertices, faces, again, cuts = cut_open(vertices, turned, against(turned))
+    note(cuts, "edges cut open where the faces can't agree")
+    origin = origin[again]
+
+    used, faces = np.unique(faces, return_inverse=True)
+    became = np.full(len(place) + 1, -1)
+    became[origin[used][::-1]] = np.arange(len(used))[::-1]  # of the copies of a vertex the first
+    mesh = Mesh(vertices[used], faces.reshape(-1, 3), name)
+    return Repaired(mesh, became[place], changes)
+
+
+def crowded(faces: np.ndarray) -> np.ndarray:
+    """bool [F, 3]: whether the edge from corner k to the next has more than two faces."""
+    _, number, count = np.unique(np.sort(edges(faces), axis=1), axis=0, return_inverse=True,
+                                 return_counts=True)  # fmt: skip
+    return (count > 2)[number.reshape(-1)].reshape(-1, 3)
+
+
+def against(faces: np.ndarray) -> np.ndarray:
+    """bool [F, 3]: whether the edge from corner k to the next has two faces in that direction."""
+    _, number, count = np.unique(edges(faces), axis=0, return_inverse=True, return_counts=True)
+    return (count > 1)[number.reshape(-1)].reshape(-1, 3)
+
+
+def edges(faces: np.ndarray) -> np.ndarray:
+    """[3 F, 2]: those of each face, in its direction."""
+    return faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
+
+
+def cut_open(
+    vertices: np.ndarray, faces: np.ndarray, along: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, int]:
+    """Separates the faces at some of their edges: vertices [W, 3], faces [F, 3], for each of the W
+    vertices the one it is a copy of, and the number of edges.
+
+    along: bool [F, 3], edges from corner k to the next. Corners of faces stay one vertex where a
+    path over the other edges joins them.
+    """
+    if not along.any():
+        return vertices, faces, np.arange(len(vertices)), 0
+    pairs = edges(faces)
+    undirected = np.sort(pairs, axis=1)
+    flat = along.ravel()
+    # edge e of face f has corners 3 f + e and 3 f + (e + 1) % 3
+    begin = np.arange(len(pairs))
+    end = begin - begin % 3 + (begin + 1) % 3
+    low = np.where(pairs[:, 0] < pairs[:, 1], begin, end)
+    high = begin + end - low
+    key = undirected[:, 0] * len(vertices) + undirected[:, 1]
+    order = np.argsort(key[~flat], kind="stable")
+    open_ = np.flatnonzero(~flat)[order]
+    same = key[open_[1:]] == key[open_[:-1]]
+    one, two = open_[:-1][same], open_[1:][same]
+    rows, columns = np.concatenate([low[one], high[one]]), np.concatenate([low[two], high[two]])
+    graph = coo_array((np.ones(len(rows)), (rows, columns)), shape=(len(pairs), len(pairs)))
+    count, number = connected_components(graph, directed=False)
+    origin = np.empty(count, dtype=np.int64)
+    origin[number] = faces.ravel()
+    return (
+        vertices[origin],
+        number.reshape(-1, 3).astype(np.int64),
+        origin,
+        len(np.unique(key[flat])),
+    )

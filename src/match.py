@@ -1,0 +1,134 @@
+"""Match meshes: `python -m src.match source=a.ply target=b.obj`."""
+
+from __future__ import annotations
+
+import logging
+import os
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+from omegaconf import DictConfig
+
+from src.cli import entry_point
+from src.config import ConfigError, typed
+from src.data.shapes import DataError
+from src.runs import write_whole
+
+REFUSED = "refused.txt"
+
+log = logging.getLogger("src.match")
+
+
+@dataclass
+class Match:
+    source: str | None = None
+    sources: str | None = None
+    target: str | None = None
+    run: str | None = None
+    output: str | None = None
+    repair: bool = False
+    resample: bool | None = None
+    smooth: bool = False
+    transfer: str | None = None
+    picture: bool | None = None
+    accelerator: str = "cpu"
+    workers: int | None = None
+
+
+def check(config: DictConfig) -> DictConfig:
+    found = typed(config, Match)
+    if (found.source is None) == (found.sources is None):
+        raise ConfigError("give source=, a mesh, or sources=, a pattern such as 'scans/*.ply'")
+    if found.transfer and not found.target:
+        raise ConfigError("transfer= carries something from a target to the source; give target=")
+    if found.workers is not None and found.workers < 1:
+        raise ConfigError(f"workers must be at least 1; got {found.workers}")
+    return found
+
+
+@entry_point("match", check)
+def main(config: DictConfig) -> None:
+    folder = (many if config.sources else pair)(config)
+    log.info("Written to:  %s", folder)
+
+
+def pair(config: DictConfig) -> Path:
+    """Match one mesh. Returns the folder of what it wrote."""
+    from src import matches
+
+    name = Path(config.source).stem
+    if config.target:
+        name += f"_to_{Path(config.target).stem}"
+    folder = Path(config.output or Path("outputs", "matches", name))
+    job = matches.Job.of(config)
+    began = time.perf_counter()
+    source = matches.one(job, config.source, folder)
+    for line in matches.told(source):
+        log.info(line)
+    if config.picture is not False:
+        matches.draw(folder, job, source)
+    log.info("Seconds:     %.1f", time.perf_counter() - began)
+    return folder
+
+
+def many(config: DictConfig) -> Path:
+    """Match every mesh of a pattern, each in a folder of its own; finished ones are left as they
+    are. Errors: DataError if no mesh could be used."""
+    from joblib import Parallel, cpu_count, delayed
+    from tqdm import tqdm
+
+    from src import matches
+
+    folder = Path(config.output or Path("outputs", "matches", "sources"))
+    meshes = named(config.sources)
+    job = matches.Job.of(config)
+    job.target_labels()  # says what is wrong with it before the work begins
+    waiting = [(path, folder / name) for name, path in meshes.items()
+               if not matches.done(job, path, folder / name)]  # fmt: skip
+    if len(waiting) < len(meshes):
+        log.info("%d of %d are done already", len(meshes) - len(waiting), len(meshes))
+    workers = min(config.workers or cpu_count(), max(1, len(waiting)))
+    refused: dict[str, str] = {}
+    began = time.perf_counter()
+    pool = Parallel(n_jobs=workers, return_as="generator_unordered", pre_dispatch="2 * n_jobs")
+    work = pool(delayed(matches.attempt)(job, *each, workers) for each in waiting)
+    for path, reason in tqdm(work, total=len(waiting), desc="Matching", unit="mesh"):
+        if reason:
+            refused[path] = reason
+            tqdm.write(f"refused: {reason}")
+    if config.picture:
+        for path, place in waiting:
+            if path not in refused:
+                matches.draw(place, job, matches.one(job, path, place))
+    seconds = time.perf_counter() - began
+    log.info("%d meshes matched in %.1f s, %d refused", len(waiting) - len(refused), seconds,
+             len(refused))  # fmt: skip
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / REFUSED).unlink(missing_ok=True)
+    if refused:
+        write_whole(folder / REFUSED, "".join(f"{refused[path]}\n" for path in sorted(refused)))
+        raise DataError(f"{len(refused)} of {len(meshes)} meshes were refused; {folder / REFUSED} "
+                        "says why")  # fmt: skip
+    return folder
+
+
+def named(pattern: str) -> dict[str, str]:
+    """The mesh files that a pattern finds, by names that differ. Errors: DataError for none."""
+    import glob
+
+    from src.geometry.mesh import SUFFIXES
+
+    found = sorted(path for path in glob.glob(pattern, recursive=True)
+                   if path.lower().endswith(SUFFIXES) and os.path.isfile(path))  # fmt: skip
+    if not found:
+        raise DataError(f"sources: {pattern!r} matches no mesh file ({', '.join(SUFFIXES)})")
+    above = os.path.commonpath([os.path.dirname(os.path.abspath(path)) for path in found])
+    names = [os.path.relpath(os.path.abspath(path), above).replace(os.sep, "_") for path in found]
+    stems = [os.path.splitext(name)[0] for name in names]
+    return {stem if stems.count(stem) == 1 else name: path
+            for stem, name, path in zip(stems, names, found, strict=True)}  # fmt: skip
+
+
+if __name__ == "__main__":
+    main()

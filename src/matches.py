@@ -1,0 +1,244 @@
+"""What `python -m src.match` computes and writes for each mesh."""
+
+from __future__ import annotations
+
+import io
+import logging
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import trimesh
+from omegaconf import DictConfig
+from scipy.spatial.transform import Rotation
+
+from src.data.attributes import KINDS, read_attribute
+from src.data.scans import Scan, open_scan
+from src.data.shapes import DataError
+from src.data.store import digest
+from src.figures import confidence_colors, encoded, picture_figure, place_colors
+from src.geometry.mesh import Mesh, MeshError
+from src.matching import SHIPPED, Labels, Matcher, nearest
+from src.render import RenderError, Row, render
+from src.runs import BEST, write_whole
+
+FILE = "match.npz"
+
+log = logging.getLogger("src.matches")
+
+
+class Side(NamedTuple):
+    scan: Scan
+    labels: Labels
+
+
+class Matched(NamedTuple):
+    """One mesh and its labels; and those of the target and the map to it, int32 [V], or None."""
+
+    source: Side
+    target: Side | None
+    map: np.ndarray | None
+
+
+@dataclass(frozen=True)
+class Job:
+    """What is the same for all meshes of a command. Its parts are computed once per process."""
+
+    run: str
+    target: str | None
+    repair: bool
+    resample: bool | None
+    smooth: bool
+    transfer: str | None
+    accelerator: str
+
+    @classmethod
+    def of(cls, config: DictConfig) -> Job:
+        return cls(str(config.run or SHIPPED), config.target, config.repair, config.resample,
+                   config.smooth, config.transfer, config.accelerator)  # fmt: skip
+
+    def matcher(self) -> Matcher:
+        return _matcher(self.run, self.accelerator, self.resample, self.smooth)
+
+    def target_labels(self) -> Side | None:
+        return _target(self) if self.target else None
+
+    def key(self, path: str) -> str:
+        """The same as long as mesh, target, network and settings are."""
+        files = [path, Path(self.run) / BEST, *filter(None, [self.target])]
+        if self.transfer and self.transfer not in KINDS:
+            files.append(self.transfer)
+        settings = self.repair, self.resample, self.smooth, self.transfer
+        return digest(*(_content(str(file)) for file in files), *settings)
+
+
+@cache
+def _matcher(run: str, accelerator: str, resampled: bool | None, smooth: bool) -> Matcher:
+    return Matcher.load(run, accelerator=accelerator, resampled=resampled, smooth=smooth)
+
+
+@cache
+def _target(job: Job) -> Side:
+    scan = open_scan(job.target, job.repair)
+    return Side(scan, job.matcher().label(scan))
+
+
+def _content(path: str) -> str:
+    try:
+        return digest(np.fromfile(path, dtype=np.uint8))
+    except OSError as error:
+        raise MeshError(f"{path}: {error.strerror or error}") from error
+
+
+def done(job: Job, path: str, folder: Path) -> bool:
+    """Whether the folder holds the match of that mesh, whole."""
+    try:
+        with np.load(folder / FILE, allow_pickle=False) as file:
+            return str(file["key"]) == job.key(path)
+    except Exception:  # whatever numpy says of a file that is not there, or not whole
+        return False
+
+
+def attempt(job: Job, path: str, folder: Path, processes: int) -> tuple[str, str | None]:
+    """`one` in a process of several; the path, and in words why the mesh was refused."""
+    import torch
+
+    if processes > 1:
+        torch.set_num_threads(1)
+    try:
+        one(job, path, folder)
+        return path, None
+    except (MeshError, DataError, OSError) as error:
+        return path, str(error)
+
+
+def one(job: Job, path: str, folder: Path) -> Matched:
+    """Match a mesh and write what it gives. Errors: MeshError, DataError."""
+    scan = open_scan(path, job.repair)
+    carried = None
+    if job.transfer:
+        vertices = len(job.target_labels().scan.vertices)
+        carried = read_attribute(job.target, job.transfer, vertices)
+    source = Side(scan, job.matcher().label(scan))
+    target = job.target_labels()
+    found = Matched(source, target, nearest(source.labels, target.labels) if target else None)
+    folder.mkdir(parents=True, exist_ok=True)
+    template = job.matcher().template
+    (folder / FILE).unlink(missing_ok=True)  # comes last: then all is there
+    arrays = {f"source_{k}": v for k, v in source.labels._asdict().items()}
+    colors = place_colors(template, source.labels.points)
+    if target:
+        arrays |= {f"target_{k}": v for k, v in target.labels._asdict().items()}
+        arrays["map"] = found.map
+        _write_lines(folder / "map.txt", found.map)
+        theirs = place_colors(template, target.labels.points)
+        colors = taken(found.map, theirs, 0.6)
+        _write_colored(folder / "target.ply", target.scan, theirs)
+    _write_lines(folder / "template.txt", source.labels.template)
+    _write_colored(folder / "source.ply", scan, colors)
+    if carried is not None:
+        _write_carried(folder, scan, taken(found.map, carried, 0), job.transfer)
+    whole = io.BytesIO()
+    np.savez_compressed(whole, key=np.array(job.key(path)), **arrays)
+    write_whole(folder / FILE, whole.getvalue())
+    return found
+
+
+def taken(match: np.ndarray, values: np.ndarray, nothing: float) -> np.ndarray:
+    """For every source vertex the value [Vb, ...] of its counterpart, [Va, ...]."""
+    found = values[match]
+    found[match < 0] = nothing
+    return found
+
+
+def told(found: Matched) -> list[str]:
+    """What is to say of it, in lines."""
+    lines = []
+    for what, side in (("source", found.source), ("target", found.target)):
+        if side is not None:
+            scan, labels = side
+            known = labels.template >= 0
+            lines.append(
+                f"{what}: {scan.mesh.name}, {len(scan.vertices):,} vertices; confidence "
+                f"{np.median(labels.confidence[known]):.2f} in the median, below 0.1 at "
+                f"{100 * (labels.confidence[known] < 0.1).mean():.1f} %"
+            )
+            lines += [f"  {remark}" for remark in scan.remarks]
+    return lines
+
+
+def draw(folder: Path, job: Job, found: Matched) -> None:
+    """correspondence.png and confidence.png: target (or template) and source, upright as the
+    template is. Without an OpenGL library a warning takes their place."""
+    template = job.matcher().template
+    places = place_colors(template, template.vertices)
+    sides = [(found.source, "source")]
+    if found.target:
+        sides.insert(0, (found.target, "target"))
+    else:
+        sides.insert(0, (None, "template"))
+    meshes, colors, sure = [], [], []
+    for side, _ in sides:
+        if side is None:
+            meshes.append(template), colors.append(places), sure.append(np.ones(len(places)))
+            continue
+        of_mesh = np.zeros(len(side.scan.mesh.vertices), dtype=np.int64)
+        there = np.flatnonzero(side.scan.place >= 0)
+        of_mesh[side.scan.place[there]] = there
+        color = place_colors(template, side.labels.points)
+        if side is found.source and found.map is not None:
+            color = taken(found.map, place_colors(template, found.target.labels.points), 0.6)
+        meshes.append(upright(side.scan.mesh, side.labels.points[of_mesh],
+                              side.labels.confidence[of_mesh], template))  # fmt: skip
+        colors.append(color[of_mesh]), sure.append(side.labels.confidence[of_mesh])
+    rows = [Row(meshes, colors), Row(meshes, [confidence_colors(c) for c in sure])]
+    try:
+        drawn = render(rows, job.matcher().up)
+    except RenderError as error:
+        log.warning("no pictures: %s", error)
+        return
+    names = [name for _, name in sides]
+    for name, picture in zip(("correspondence", "confidence"), drawn, strict=True):
+        bar = name == "confidence"
+        figure = picture_figure(*picture, names, bar="confidence" if bar else None)
+        write_whole(folder / f"{name}.png", encoded(figure, "png"))
+
+
+def upright(mesh: Mesh, points: np.ndarray, weights: np.ndarray, template: Mesh) -> Mesh:
+    """The mesh turned and scaled to stand as the template does (Kabsch 1976)."""
+    middle, theirs = mesh.vertices.mean(axis=0), points.mean(axis=0)
+    scaled = (mesh.vertices - middle) / np.sqrt(mesh.area) * np.sqrt(template.area)
+    turn, _ = Rotation.align_vectors(points - theirs, scaled, weights + 1e-6)
+    return Mesh(turn.apply(scaled), mesh.faces, mesh.name)
+
+
+def _write_lines(path: Path, numbers: np.ndarray) -> None:
+    write_whole(path, "\n".join(map(str, numbers.tolist())) + "\n")
+
+
+def _mesh(scan: Scan, **visual: Any) -> trimesh.Trimesh:
+    """The user's own vertices, and those of their faces that can be drawn."""
+    faces = scan.faces[((scan.faces >= 0) & (scan.faces < len(scan.vertices))).all(axis=1)]
+    return trimesh.Trimesh(scan.vertices, faces, process=False, **visual)
+
+
+def _write_colored(path: Path, scan: Scan, colors: np.ndarray) -> None:
+    colored = _mesh(scan, vertex_colors=np.round(255 * colors).astype(np.uint8))
+    write_whole(path, colored.export(file_type="ply"))
+
+
+def _write_carried(folder: Path, scan: Scan, values: np.ndarray, what: str) -> None:
+    """transferred.npy, and with colours transferred.ply, with uv transferred.obj."""
+    whole = io.BytesIO()
+    np.save(whole, values)
+    write_whole(folder / "transferred.npy", whole.getvalue())
+    if what == "color":
+        write_whole(
+            folder / "transferred.ply", _mesh(scan, vertex_colors=values).export(file_type="ply")
+        )
+    if what == "uv":
+        textured = _mesh(scan, visual=trimesh.visual.TextureVisuals(uv=values))
+        text = trimesh.exchange.obj.export_obj(textured, include_normals=False, write_texture=False)
+        write_whole(folder / "transferred.obj", text)
