@@ -66,7 +66,9 @@ def _visual(visual, what: str) -> np.ndarray | None:
     if what == "uv":
         return getattr(visual, "uv", None)
     if visual.kind == "texture" and visual.uv is not None:
-        visual = visual.to_color()
+        images = (getattr(visual.material, name, None) for name in ("image", "baseColorTexture"))
+        if any(image is not None for image in images):
+            visual = visual.to_color()
     return visual.vertex_colors[:, :3] if visual.kind == "vertex" else None
 
 
@@ -91,9 +93,11 @@ def _of_obj(path: Path, what: str) -> np.ndarray | None:
                 return None
             values = np.array([vertex[3:6] for vertex in vertices], dtype=float)
             return np.round(255 * values.clip(0, 1)).astype(np.uint8)
+        if not first:
+            return None
         values = np.full((len(vertices), 2), np.nan)
         values[list(first)] = np.array(textures, dtype=float)[list(first.values())]
-        return values if first else None
+        return values
     except (ValueError, IndexError, OSError) as error:
         raise DataError(f"{path}: its {what} can't be read ({error})") from error
 

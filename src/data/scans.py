@@ -11,7 +11,7 @@ import trimesh
 from src.geometry.mesh import Mesh, MeshError, read_arrays
 from src.geometry.repair import repair as mend
 
-MOST, LEAST = 1e100, 1e-100  # of a size, in whatever unit: beyond, areas have no number any more
+LEAST, MOST = 1e-70, 1e70  # of a size, in whatever unit: beyond, squares of areas are no numbers
 
 
 class Scan(NamedTuple):
@@ -55,8 +55,8 @@ def scan(vertices: np.ndarray, faces: np.ndarray, name: str, repair: bool = Fals
         raise MeshError(f"{name}: no faces, so there is no surface to match")
     size = np.ptp(mesh.vertices[mesh.faces].reshape(-1, 3), axis=0).max()
     if not LEAST < size < MOST or not 0 < mesh.area < np.inf:
-        raise MeshError(f"{name}: a size of {size:.3g} and an area of {mesh.area:.3g}; "
-                        "there is no surface to describe")  # fmt: skip
+        raise MeshError(f"{name}: {size:.3g} across, which is no surface to describe; it needs an "
+                        f"area, and a size of {LEAST:g} to {MOST:g}")  # fmt: skip
     solid = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
     if solid.is_watertight and solid.is_winding_consistent and solid.volume < 0:
         mesh = Mesh(mesh.vertices, mesh.faces[:, ::-1], name)

@@ -13,7 +13,7 @@ class GeodesicSolver:
 
     The heat method is a smooth approximation, within about one per cent at ordinary resolutions.
     From one component to another, and from a vertex without a face, there is no distance: inf.
-    Errors: MeshError for a mesh without surface area.
+    Errors: MeshError for a mesh without surface area, or one so degenerate that the method fails.
     """
 
     def __init__(self, mesh: Mesh):
@@ -23,9 +23,13 @@ class GeodesicSolver:
         self._place = np.full(len(mesh.vertices), -1)
         self._place[self._used] = np.arange(len(self._used))
         self._component = _components(mesh)
-        self._solver = potpourri3d.MeshHeatMethodDistanceSolver(
-            mesh.vertices[self._used], faces.reshape(-1, 3)
-        )
+        try:
+            self._solver = potpourri3d.MeshHeatMethodDistanceSolver(
+                mesh.vertices[self._used], faces.reshape(-1, 3)
+            )
+        except RuntimeError as error:
+            raise MeshError(f"{mesh.name}: its faces are so thin that there are no geodesic "
+                            f"distances to be had ({error})") from error  # fmt: skip
 
     def row(self, source: int) -> np.ndarray:
         """float64 [V], the distance of every vertex to `source`; exactly 0 at the source."""

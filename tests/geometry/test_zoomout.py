@@ -1,0 +1,48 @@
+"""ZoomOut: a noisy map of a surface to itself becomes nearly the identity."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import trimesh
+
+from src.geometry.mesh import Mesh, MeshError
+from src.geometry.zoomout import TO, eigenfunctions, zoomout
+from tests.meshes import bumpy_sphere
+
+MESH = bumpy_sphere(subdivisions=3)
+
+
+def test_eigenfunctions_are_orthonormal_and_those_of_the_sphere():
+    sphere = trimesh.creation.icosphere(subdivisions=3)
+    functions, masses = eigenfunctions(Mesh(sphere.vertices, sphere.faces), 9)
+    np.testing.assert_allclose((functions.T * masses) @ functions, np.eye(9), atol=1e-8)
+    assert masses.sum() == pytest.approx(4 * np.pi, rel=0.02)
+    np.testing.assert_allclose(np.ptp(functions[:, 0]), 0, atol=1e-6)
+    # the next three span the linear functions
+    x = np.asarray(sphere.vertices)
+    fitted = functions[:, 1:4] @ ((functions[:, 1:4].T * masses) @ x)
+    np.testing.assert_allclose(fitted, x, atol=0.01)
+
+
+def test_noise_goes():
+    functions, masses = eigenfunctions(MESH, TO)
+    rng = np.random.default_rng(0)
+    truth = np.arange(len(masses))
+    noisy = np.where(rng.random(len(masses)) < 0.3, rng.permutation(len(masses)), truth)
+
+    def error(match):
+        return np.linalg.norm(MESH.vertices[match] - MESH.vertices, axis=1).mean()
+
+    assert error(zoomout(functions, masses, functions, noisy)) < 0.1 * error(noisy)
+
+
+def test_the_truth_stays():
+    functions, masses = eigenfunctions(MESH, TO)
+    truth = np.arange(len(masses))
+    np.testing.assert_array_equal(zoomout(functions, masses, functions, truth), truth)
+
+
+def test_a_mesh_that_is_too_small_is_refused():
+    with pytest.raises(MeshError, match="80 eigenfunctions of 42 vertices"):
+        eigenfunctions(bumpy_sphere(subdivisions=1), 80)
