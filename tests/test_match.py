@@ -243,7 +243,7 @@ def test_many_are_matched_and_those_done_are_skipped(cli, trained, files):  # no
     when = {i: os.stat(f"out/{i}/match.npz").st_mtime_ns for i in range(3)}
     Path("scans/broken.ply").unlink()
     Path("out/2/match.npz").write_bytes(b"half")
-    code, out, err = cli(*common, program=main)
+    code, out, _ = cli(*common, program=main)
     assert code == 0 and "2 of 3 are done already" in out and "1 meshes matched" in out
     assert not Path("out/refused.txt").exists()
     after = {i: os.stat(f"out/{i}/match.npz").st_mtime_ns for i in range(3)}

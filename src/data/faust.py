@@ -7,7 +7,7 @@ import zipfile
 from collections import defaultdict
 from collections.abc import Iterable
 from functools import cached_property
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 
 from src.data.shapes import DataError, Shape, ShapeSet, registered_shape, subject_split
 from src.geometry.mesh import Mesh, parse_mesh, read_mesh
@@ -73,13 +73,17 @@ def _registrations(root: Path) -> dict[str, str]:
         return _most_complete(path.relative_to(root).as_posix() for path in paths)
     try:
         with zipfile.ZipFile(root) as archive:
-            return _most_complete(archive.namelist())
+            names = archive.namelist()
     except FileNotFoundError as error:
         raise _unusable(f"{root} does not exist") from error
     except zipfile.BadZipFile as error:
         raise _unusable(f"{root} is neither a folder nor an intact zip ({error})") from error
     except OSError as error:
         raise _unusable(f"{root} cannot be read ({error.strerror or error})") from error
+    for name in names:  # none is ever written, but such an archive is not what it says
+        if name.startswith("/") or ".." in PurePosixPath(name.replace("\\", "/")).parts:
+            raise _unusable(f"{root} holds {name!r}, which leads out of it")
+    return _most_complete(names)
 
 
 def _most_complete(paths: Iterable[str]) -> dict[str, str]:

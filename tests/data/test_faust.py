@@ -93,6 +93,15 @@ def test_all_ways_to_give_faust_give_the_same_shapes_in_its_order(root):
     assert np.allclose(faust.template.vertices, first.vertices, atol=1e-6)
 
 
+@pytest.mark.parametrize("member", ["../evil.ply", "/etc/passwd", "a/../../b", "..\\\\evil.ply"])
+def test_an_archive_that_leads_out_of_itself_is_refused(member, files, tmp_path):
+    path = archive(tmp_path / "a.zip", files, "MPI-FAUST/", seed=1)
+    with zipfile.ZipFile(path, "a") as out:
+        out.writestr(member, b"")
+    with pytest.raises(DataError, match="which leads out of it"):
+        Faust(path)
+
+
 def test_an_archive_is_read_in_place(zips):
     before = sorted(zips["zip"].parent.iterdir())
     Faust(zips["zip"]).load("tr_reg_042")

@@ -114,7 +114,7 @@ def test_a_scene_is_one_mesh_with_its_parts_in_place(tmp_path):
     scene.add_geometry(part, transform=trimesh.transformations.translation_matrix([9, 0, 0]))
     scene.export(tmp_path / "a.glb")
     found = open_scan(tmp_path / "a.glb")
-    np.testing.assert_allclose(found.vertices, np.concatenate([V, V + [9, 0, 0]]), atol=1e-6)
+    np.testing.assert_allclose(found.vertices, np.concatenate([V, V + np.array([9, 0, 0])]), atol=1e-6)
 
 
 def test_quads_are_cut_into_triangles(tmp_path):
@@ -166,7 +166,7 @@ def test_what_is_not_there_is_said(tmp_path):
     with pytest.raises(DataError, match="transfer must be"):
         read_attribute(path, "colour", 9)
     np.save(tmp_path / "x.npy", np.zeros(8))
-    with pytest.raises(DataError, match="8 values of .* for 9 vertices"):
+    with pytest.raises(DataError, match=r"8 values of .* for 9 vertices"):
         read_attribute(path, str(tmp_path / "x.npy"), 9)
     np.save(tmp_path / "bad.npy", np.array([{}], dtype=object), allow_pickle=True)
     with pytest.raises(DataError, match="no array that can be read"):

@@ -7,7 +7,9 @@ import zipfile
 import numpy as np
 import pytest
 
+from src.data.preprocessing import PatchRecipe, Recipe, descriptor_task, patch_task, run_tasks
 from src.data.store import Store, StoreError, code_version, digest
+from tests.meshes import bumpy_sphere
 
 
 @pytest.fixture
@@ -149,6 +151,44 @@ def test_two_processes_may_write_one_key(store, caplog):
     assert store.load("kind", "key") is not None and all(len(values) == 1 for values in seen)
     assert seen and "damaged" not in caplog.text
     assert [p.name for p in store.root.rglob("*") if p.is_file()] == ["key.npz"]
+
+
+def tasks():
+    recipe = Recipe(0.3, 4, patch=PatchRecipe(0.1, 3, 8))
+    spheres = [bumpy_sphere(seed, subdivisions=3) for seed in range(4)]
+    return [
+        t for mesh in spheres for t in (descriptor_task(mesh, recipe), patch_task(mesh, recipe))
+    ]
+
+
+def prepare(root, started):
+    started.release()
+    run_tasks(tasks(), Store(root), 1, "Preparing")
+
+
+def test_eight_processes_share_a_cold_cache_and_one_is_killed(tmp_path, caplog):
+    context = multiprocessing.get_context("spawn")
+    started = context.Semaphore(0)
+    processes = [
+        context.Process(target=prepare, args=(tmp_path / "all", started)) for _ in range(8)
+    ]
+    for process in processes:
+        process.start()
+    assert started.acquire(timeout=60)
+    processes[0].kill()  # in the middle, wherever that is
+    for process in processes:
+        process.join(120)
+    assert [process.exitcode for process in processes] == [-9] + 7 * [0]
+    prepare(tmp_path / "one", context.Semaphore(0))
+    caplog.set_level(logging.WARNING)
+    for task in tasks():
+        shared, alone = (
+            Store(tmp_path / name).load(task.kind, task.key) for name in ("all", "one")
+        )
+        assert shared.keys() == alone.keys()
+        for name in shared:
+            np.testing.assert_array_equal(shared[name], alone[name])
+    assert "damaged" not in caplog.text
 
 
 def test_a_digest_depends_on_everything():
