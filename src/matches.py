@@ -18,7 +18,13 @@ from src.data.attributes import KINDS, read_attribute
 from src.data.scans import Scan, open_scan
 from src.data.shapes import DataError
 from src.data.store import digest
-from src.figures import confidence_colors, encoded, picture_figure, place_colors
+from src.figures import (
+    confidence_colors,
+    encoded,
+    picture_figure,
+    place_colors,
+    template_colors,
+)
 from src.geometry.mesh import Mesh, MeshError
 from src.matching import SHIPPED, Labels, Matcher, nearest
 from src.render import RenderError, Row, render
@@ -30,8 +36,17 @@ log = logging.getLogger("src.matches")
 
 
 class Side(NamedTuple):
+    """A mesh and what a network says of it."""
+
     scan: Scan
     labels: Labels
+
+    def of_mesh(self, values: np.ndarray) -> np.ndarray:
+        """Values [V, ...] of the user's vertices as those of the vertices of `scan.mesh`."""
+        one = np.zeros(len(self.scan.mesh.vertices), dtype=np.int64)
+        there = np.flatnonzero(self.scan.place >= 0)
+        one[self.scan.place[there]] = there
+        return values[one]
 
 
 class Matched(NamedTuple):
@@ -170,47 +185,40 @@ def told(found: Matched) -> list[str]:
 
 
 def draw(folder: Path, job: Job, found: Matched) -> None:
-    """correspondence.png and confidence.png: target (or template) and source, upright as the
-    template is. Without an OpenGL library a warning takes their place."""
+    """correspondence.png and confidence.png: the target, or else the template, and the source,
+    turned to stand as the template does. Without an OpenGL library a warning takes their place."""
     template = job.matcher().template
-    places = place_colors(template, template.vertices)
-    sides = [(found.source, "source")]
-    if found.target:
-        sides.insert(0, (found.target, "target"))
+    source, target = found.source, found.target
+    if target:
+        theirs = place_colors(template, target.labels.points)
+        colors = [target.of_mesh(theirs), source.of_mesh(taken(found.map, theirs, 0.6))]
+        meshes, sure = [standing(target, template)], [target.of_mesh(target.labels.confidence)]
     else:
-        sides.insert(0, (None, "template"))
-    meshes, colors, sure = [], [], []
-    for side, _ in sides:
-        if side is None:
-            meshes.append(template), colors.append(places), sure.append(np.ones(len(places)))
-            continue
-        of_mesh = np.zeros(len(side.scan.mesh.vertices), dtype=np.int64)
-        there = np.flatnonzero(side.scan.place >= 0)
-        of_mesh[side.scan.place[there]] = there
-        color = place_colors(template, side.labels.points)
-        if side is found.source and found.map is not None:
-            color = taken(found.map, place_colors(template, found.target.labels.points), 0.6)
-        meshes.append(upright(side.scan.mesh, side.labels.points[of_mesh],
-                              side.labels.confidence[of_mesh], template))  # fmt: skip
-        colors.append(color[of_mesh]), sure.append(side.labels.confidence[of_mesh])
-    rows = [Row(meshes, colors), Row(meshes, [confidence_colors(c) for c in sure])]
+        colors = [template_colors(template),
+                  source.of_mesh(place_colors(template, source.labels.points))]  # fmt: skip
+        meshes, sure = [template], [np.ones(len(template.vertices))]
+    meshes.append(standing(source, template))
+    sure.append(source.of_mesh(source.labels.confidence))
     try:
-        drawn = render(rows, job.matcher().up)
+        rows = [Row(meshes, colors), Row(meshes, [confidence_colors(each) for each in sure])]
+        correspondence, confidence = render(rows, job.matcher().up)
     except RenderError as error:
         log.warning("no pictures: %s", error)
         return
-    names = [name for _, name in sides]
-    for name, picture in zip(("correspondence", "confidence"), drawn, strict=True):
-        bar = name == "confidence"
-        figure = picture_figure(*picture, names, bar="confidence" if bar else None)
+    names = ["target" if target else "template", "source"]
+    figures = {"correspondence": picture_figure(*correspondence, names),
+               "confidence": picture_figure(*confidence, names, bar="confidence")}  # fmt: skip
+    for name, figure in figures.items():
         write_whole(folder / f"{name}.png", encoded(figure, "png"))
 
 
-def upright(mesh: Mesh, points: np.ndarray, weights: np.ndarray, template: Mesh) -> Mesh:
+def standing(side: Side, template: Mesh) -> Mesh:
     """The mesh turned and scaled to stand as the template does (Kabsch 1976)."""
-    middle, theirs = mesh.vertices.mean(axis=0), points.mean(axis=0)
-    scaled = (mesh.vertices - middle) / np.sqrt(mesh.area) * np.sqrt(template.area)
-    turn, _ = Rotation.align_vectors(points - theirs, scaled, weights + 1e-6)
+    mesh, points = side.scan.mesh, side.of_mesh(side.labels.points)
+    scaled = mesh.vertices - mesh.vertices.mean(axis=0)
+    scaled *= np.sqrt(template.area / mesh.area)
+    weights = side.of_mesh(side.labels.confidence) + 1e-6
+    turn, _ = Rotation.align_vectors(points - points.mean(axis=0), scaled, weights)
     return Mesh(turn.apply(scaled), mesh.faces, mesh.name)
 
 

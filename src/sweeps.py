@@ -53,6 +53,7 @@ def job_folder(overrides: list[str], number: int) -> str:
             if not override.is_sweep_override():
                 fixed.add(override.key_or_group)
     varied = [o.lstrip("+") for o in overrides if parse(o).key_or_group not in fixed]
+    varied = [re.sub("=(True|False)$", lambda x: x[0].lower(), o) for o in varied]  # of a file
     return legal_name("_".join(varied).replace("=", "-")) or str(number)
 
 

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import logging
 import shlex
+import subprocess
+import sys
 import time
 from pathlib import Path
 
@@ -45,11 +47,30 @@ def main(config: DictConfig) -> None:
         log.info("finished before: %s", folder)
         return
     try:
-        train(config, folder)
+        if in_sweep and config.trainer.strategy != "auto":
+            train_apart(folder)
+        else:
+            train(config, folder)
     except Stopped as stopped:
         resume = f"python -m src.train {shlex.quote(f'resume={folder}')}"
         how = "the same command" if in_sweep else resume
         raise Stopped(stopped.signum, f"Stopped. To go on: {how}") from None
+
+
+def train_apart(folder: Path) -> None:
+    """A run of a sweep that takes several processes: Lightning starts the others with the command
+    line of this one, so it has to be one that runs nothing else. Errors: RunError."""
+    process = subprocess.Popen(
+        [sys.executable, "-m", "src.train", f"resume='{folder}'"], start_new_session=True
+    )
+    try:
+        code = process.wait()
+    except Stopped as stopped:
+        process.send_signal(stopped.signum)  # and to it alone, once
+        process.wait()
+        raise
+    if code:
+        raise RunError(f"the run in {folder} ended with exit code {code}; what it said is above")
 
 
 def train(config: DictConfig, folder: Path) -> dict[str, float]:

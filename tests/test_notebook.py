@@ -1,4 +1,5 @@
-"""The notebook runs, from a run folder to the pictures, and is committed without outputs."""
+"""The notebooks run, from a run folder or two meshes to pictures; they are committed without
+outputs."""
 
 from __future__ import annotations
 
@@ -27,3 +28,11 @@ def test_the_notebook_shows_a_run(toy_overrides, tmp_path, monkeypatch):
     images = [output for output in outputs if "image/png" in output.get("data", {})]
     assert len(images) == 3  # the curve, correspondences, errors
     assert any("are predicted alike" in output.get("text", "") for output in outputs)
+
+
+def test_the_notebook_matches_two_meshes():
+    notebook = nbformat.read(ROOT / "notebooks" / "match.ipynb", as_version=4)
+    NotebookClient(notebook, timeout=120, resources={"metadata": {"path": str(ROOT)}}).execute()
+    outputs = [output for cell in notebook.cells for output in cell.get("outputs", [])]
+    assert any("median confidence" in output.get("text", "") for output in outputs)
+    assert any("image/png" in output.get("data", {}) for output in outputs)

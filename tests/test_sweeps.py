@@ -125,13 +125,25 @@ def test_jobs_run_in_processes_of_their_own(toy_overrides, tmp_path, launcher):
         np.testing.assert_allclose(kept[key], value, atol=1e-4)
 
 
+def test_a_run_of_a_sweep_may_take_two_processes(toy_overrides, tmp_path):
+    ddp = ["trainer=ddp", "trainer.accelerator=cpu", "trainer.devices=2"]
+    done = subprocess.run(
+        [sys.executable, "-m", "src.train", "-m", *toy_overrides, *ddp, "optim.epochs=1",
+         f"hydra.sweep.dir={tmp_path}", "hydra.sweep.subdir=job"],
+        cwd=ROOT, capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert done.stdout.count("Test on 3 unseen meshes") == 1  # once, by both together
+    assert [state for _, state, _ in states(tmp_path)] == ["finished"]
+
+
 @pytest.mark.parametrize(
     "name, jobs",
     [
         ("networks", {"model-fcs", "model-gcnn3", "model-lstm"}),
-        ("remeshed", {f"model-{m}_metric-{x}" for m in ("fcs", "lstm") for x in ("True", "False")}),
+        ("remeshed", {f"model-{m}_metric-{x}" for m in ("fcs", "lstm") for x in ("true", "false")}),
         ("lengths", {f"model-{m}_seq_len-{n}_metric-{x}" for m in ("fcs", "lstm")
-                     for n in (15, 20, 30) for x in ("True", "False")}),
+                     for n in (15, 20, 30) for x in ("true", "false")}),
     ],
     ids=["networks", "remeshed", "lengths"],
 )  # fmt: skip

@@ -49,6 +49,20 @@ def test_a_shape_is_remeshed_once_and_kept(toys, monkeypatch):
         toys.load("val/0.ply")
 
 
+def test_training_shapes_can_have_several_tessellations(tmp_path):
+    shapes = Remeshed(Toys(), Store(tmp_path), 1, "isotropic", 120, copies=3)
+    names = ["train/0.ply", "train/0.ply~2", "train/0.ply~3"]
+    assert shapes.names["train"] == [names[0], "train/1.ply", names[1], "train/1.ply~2", names[2],
+                                     "train/1.ply~3"]  # fmt: skip
+    assert shapes.names["val"] == ["val/0.ply"]
+    shapes.prepare(names)
+    loaded = [shapes.load(name).mesh.vertices for name in names]
+    assert not np.allclose(loaded[0], loaded[1]) and not np.allclose(loaded[1], loaded[2])
+    once = Remeshed(Toys(), Store(tmp_path), 1, "isotropic", 120).load(names[0])
+    np.testing.assert_array_equal(once.mesh.vertices, loaded[0])
+    assert shapes.source(names[2]).mesh.name == shapes.source(names[0]).mesh.name
+
+
 def test_the_truth_is_where_the_vertex_lies(toys):
     """On the shape itself: the template's point, carried over, is at the vertex."""
     shape, source = toys.load("test/0.ply"), toys.source("test/0.ply").mesh

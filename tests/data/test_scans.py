@@ -114,7 +114,8 @@ def test_a_scene_is_one_mesh_with_its_parts_in_place(tmp_path):
     scene.add_geometry(part, transform=trimesh.transformations.translation_matrix([9, 0, 0]))
     scene.export(tmp_path / "a.glb")
     found = open_scan(tmp_path / "a.glb")
-    np.testing.assert_allclose(found.vertices, np.concatenate([V, V + np.array([9, 0, 0])]), atol=1e-6)
+    both = np.concatenate([V, V + np.array([9, 0, 0])])
+    np.testing.assert_allclose(found.vertices, both, atol=1e-6)
 
 
 def test_quads_are_cut_into_triangles(tmp_path):

@@ -1,0 +1,99 @@
+"""What changes of a mesh do to the labels it gets, outside the tests:
+
+    python -m tests.robustness 20 [run folder]
+
+On so many of the 20 test bodies, with the network that comes with the repository or another: exact
+match, and the mean error to the true point on the template, over the square root of its area.
+"""
+
+from __future__ import annotations
+
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import trimesh
+from tqdm import tqdm
+
+from src.data.bodies import Bodies
+from src.data.reference import ReferenceDistances
+from src.data.remeshed import Remeshed
+from src.data.scans import scan
+from src.data.shapes import Shape
+from src.data.store import Store
+from src.evaluation import evenly
+from src.matching import Matcher
+from src.metrics import geodesic_errors, point_errors
+
+STORE = Store("outputs/cache")
+
+
+def changed(body: Shape, what: str, rng: np.random.Generator) -> Shape:
+    vertices, faces = body.mesh.vertices, body.mesh.faces
+    if what == "rotated":
+        turn = trimesh.transformations.random_rotation_matrix(rng.random(3))[:3, :3]
+        vertices = vertices @ turn.T
+    elif what == "times 1000, moved by 1 km":
+        vertices = 1000 * vertices + np.array([1e6, 0, 0])
+    elif what == "renumbered":
+        return body.renumbered(rng.permutation(len(vertices)))
+    elif what == "noise of 2 mm":
+        vertices = vertices + rng.normal(scale=0.002, size=vertices.shape)
+    elif what == "a tenth of the faces gone":
+        faces = faces[rng.random(len(faces)) >= 0.1]
+    elif what == "cut off at the waist":
+        keep = vertices[:, 2] > np.median(vertices[:, 2])
+        faces = faces[keep[faces].all(axis=1)]
+    return Shape(type(body.mesh)(vertices, faces, body.mesh.name), body.labels, body.template_size)
+
+
+def main() -> None:
+    count, run = int(sys.argv[1]), (sys.argv[2] if len(sys.argv) > 2 else None)
+    bodies = Bodies(1500)
+    names = evenly(bodies.names["test"], count)
+    reference = ReferenceDistances(bodies.template, STORE)
+    plain = [bodies.load(name) for name in names]
+    rng = np.random.default_rng(0)
+    cases = {
+        what: [changed(body, what, rng) for body in plain]
+        for what in ("as they are", "rotated", "times 1000, moved by 1 km", "renumbered",
+                     "noise of 2 mm", "a tenth of the faces gone", "cut off at the waist")
+    }  # fmt: skip
+    for policy, vertices in [("isotropic", 750), ("isotropic", 1500), ("isotropic", 3000),
+                             ("isotropic", 15000), ("mixed", 1500)]:  # fmt: skip
+        made = Remeshed(bodies, STORE, None, policy, vertices)
+        made.prepare(names)
+        cases[f"{policy}, {vertices:,} vertices"] = [made.load(name) for name in names]
+    options = {"plain": {}, "never resampled": {"resampled": False},
+               "always resampled": {"resampled": True}, "smooth": {"smooth": True}}  # fmt: skip
+    print(f"{'':36}" + "".join(f"{name:>26}" for name in options))
+    matchers = [Matcher.load(run and Path(run), **each) for each in options.values()]
+    for what, shapes in cases.items():
+        row = []
+        for matcher in matchers:
+            row.append(measured(matcher, shapes, reference))
+        print(f"{what:36}" + "".join(f"{100 * e:8.1f} % {m:7.4f} {s:6.2f} s" for e, m, s in row),
+              flush=True)  # fmt: skip
+
+
+def measured(matcher: Matcher, shapes: list[Shape], reference: ReferenceDistances):
+    exact, errors, seconds = [], [], []
+    for shape in tqdm(shapes, leave=False):
+        began = time.perf_counter()
+        labels = matcher.label(scan(shape.mesh.vertices, shape.mesh.faces, shape.mesh.name))
+        seconds.append(time.perf_counter() - began)
+        known = labels.template >= 0
+        found = labels.template[known].astype(np.int64)
+        exact.append((found == shape.labels[known]).mean())
+        if shape.points is None:
+            error = geodesic_errors(found, shape.labels[known], reference)
+        else:
+            true = (array[known] for array in shape.points)
+            error = point_errors(found, *true, reference, reference.place)
+        errors.append(error.mean())
+    return np.mean(exact), np.mean(errors), np.median(seconds)
+
+
+if __name__ == "__main__":
+    main()
