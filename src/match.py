@@ -16,6 +16,14 @@ from src.data.shapes import DataError
 from src.runs import write_whole
 
 REFUSED = "refused.txt"
+CONTENTS = {
+    "map.txt": "for every vertex of the source one of the target, -1 for none",
+    "template.txt": "for every vertex of the source one of the template",
+    "match.npz": "both, for both meshes, with confidences and places on the template",
+    "source.ply target.ply": "in colours: equal ones correspond",
+    "transferred.npy transferred.ply transferred.obj": "what was carried over to the source",
+    "correspondence.png confidence.png": "both from the front and the back",
+}
 
 log = logging.getLogger("src.match")
 
@@ -68,6 +76,10 @@ def pair(config: DictConfig) -> Path:
         log.info(line)
     if config.picture is not False:
         matches.draw(folder, job, source)
+    for names, what in CONTENTS.items():
+        there = [name for name in names.split() if (folder / name).exists()]
+        if there:
+            log.info("  %-36s %s", " ".join(there), what)
     log.info("Seconds:     %.1f", time.perf_counter() - began)
     return folder
 

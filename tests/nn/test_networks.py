@@ -101,7 +101,20 @@ def test_dropout_is_off_in_evaluation_and_on_in_training(batch):
 def test_the_forget_gate_begins_open():
     layer = LSTMNet(10, 21).layers[0]
     i, f, g, o = layer.input.bias.chunk(4)
-    assert (f == 1).all() and not any(gate.any() for gate in (i, g, o))
+    assert (f == 3).all() and not any(gate.any() for gate in (i, g, o))
+
+
+@pytest.mark.parametrize("cls", [FCSNet, LSTMNet])
+def test_vertices_differ_after_three_layers(cls):
+    """With a forget bias of 1 and smaller weights, those of LSTM-NET hardly did."""
+    torch.manual_seed(0)
+    net = cls(544, 10, **({"seq_len": 20} if cls is FCSNet else {}))
+    x = torch.relu(torch.randn(300, 16))
+    spirals = torch.randint(300, (300, 20))
+    spirals[:, 0] = torch.arange(300)
+    for layer in net.layers:
+        x = torch.relu(layer(x, spirals))
+    assert x.std(dim=0).mean() > 0.015
 
 
 @pytest.mark.parametrize("name", ["fcs", "lstm"])
