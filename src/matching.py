@@ -27,7 +27,9 @@ from src.predictor import Predictor, template_of
 from src.runs import BEST, read_checkpoint
 
 SHIPPED = Path(__file__).parent / "data" / "assets" / "bodies_run"
-ALIKE = 1.5  # a mesh with so many times more or fewer vertices than in training is resampled
+# A mesh with so many times more or fewer vertices than in training is resampled. Patches have a
+# size of their own, while spirals grow with the edges.
+ALIKE_PATCHES, ALIKE_SPIRALS = 4.0, 1.5
 
 
 class Labels(NamedTuple):
@@ -57,8 +59,8 @@ class Matcher:
 
     saved: of `read_checkpoint`. accelerator: "cpu" or "gpu". resampled: True: meshes are resampled
     to the density of the meshes in training first, and what is predicted there is carried over;
-    False: never; None: those with 1.5 times more or fewer vertices. smooth: refine the labels of
-    each mesh by ZoomOut. Errors: RunError for a checkpoint without template.
+    False: never; None: those of a density far from it. smooth: refine the labels of each mesh by
+    ZoomOut. Errors: RunError for a checkpoint without template.
     """
 
     def __init__(
@@ -108,7 +110,8 @@ class Matcher:
     def _resamples(self, vertices: int) -> bool:
         if self._resampled is not None:
             return self._resampled
-        return not self._resolution / ALIKE <= vertices <= self._resolution * ALIKE
+        alike = ALIKE_PATCHES if self._recipe.patch else ALIKE_SPIRALS
+        return not self._resolution / alike <= vertices <= self._resolution * alike
 
     def _predict(self, mesh: Mesh) -> tuple[np.ndarray, np.ndarray]:
         tasks = descriptor_task(mesh, self._recipe), neighbourhood_task(mesh, self._recipe)

@@ -27,6 +27,7 @@ from src.matching import Matcher
 from src.metrics import geodesic_errors, point_errors
 
 STORE = Store("outputs/cache")
+HOLES = "a tenth of the faces gone"
 
 
 def changed(body: Shape, what: str, rng: np.random.Generator) -> Shape:
@@ -40,7 +41,7 @@ def changed(body: Shape, what: str, rng: np.random.Generator) -> Shape:
         return body.renumbered(rng.permutation(len(vertices)))
     elif what == "noise of 2 mm":
         vertices = vertices + rng.normal(scale=0.002, size=vertices.shape)
-    elif what == "a tenth of the faces gone":
+    elif what == HOLES:
         faces = faces[rng.random(len(faces)) >= 0.1]
     elif what == "cut off at the waist":
         keep = vertices[:, 2] > np.median(vertices[:, 2])
@@ -58,21 +59,21 @@ def main() -> None:
     cases = {
         what: [changed(body, what, rng) for body in plain]
         for what in ("as they are", "rotated", "times 1000, moved by 1 km", "renumbered",
-                     "noise of 2 mm", "a tenth of the faces gone", "cut off at the waist")
+                     "noise of 2 mm", HOLES, "cut off at the waist")
     }  # fmt: skip
     for policy, vertices in [("isotropic", 750), ("isotropic", 1500), ("isotropic", 3000),
                              ("isotropic", 15000), ("mixed", 1500)]:  # fmt: skip
         made = Remeshed(bodies, STORE, None, policy, vertices)
         made.prepare(names)
         cases[f"{policy}, {vertices:,} vertices"] = [made.load(name) for name in names]
-    options = {"plain": {}, "never resampled": {"resampled": False},
-               "always resampled": {"resampled": True}, "smooth": {"smooth": True}}  # fmt: skip
+    options = {"default": {}, "smooth": {"smooth": True}, "never resampled": {"resampled": False},
+               "always resampled": {"resampled": True}}  # fmt: skip
     print(f"{'':36}" + "".join(f"{name:>26}" for name in options))
     matchers = [Matcher.load(run and Path(run), **each) for each in options.values()]
+    cases["the same, repair=true"] = cases[HOLES]
     for what, shapes in cases.items():
-        row = []
-        for matcher in matchers:
-            row.append(measured(matcher, shapes, reference))
+        mend = "repair" in what
+        row = [measured(matcher, shapes, reference, mend) for matcher in matchers]
         print(f"{what:36}" + "".join(f"{100 * e:8.1f} % {m:7.4f} {s:6.2f} s" for e, m, s in row),
               flush=True)  # fmt: skip
     for what in ("as they are", "isotropic, 1,500 vertices", "mixed, 1,500 vertices"):
@@ -97,11 +98,11 @@ def by_confidence(matcher: Matcher, shapes: list[Shape], reference: ReferenceDis
     return "\n".join(lines)
 
 
-def measured(matcher: Matcher, shapes: list[Shape], reference: ReferenceDistances):
+def measured(matcher: Matcher, shapes: list[Shape], reference: ReferenceDistances, repair: bool):
     exact, errors, seconds = [], [], []
     for shape in tqdm(shapes, leave=False):
         began = time.perf_counter()
-        labels = matcher.label(scan(shape.mesh.vertices, shape.mesh.faces, shape.mesh.name))
+        labels = matcher.label(scan(shape.mesh.vertices, shape.mesh.faces, "a", repair))
         seconds.append(time.perf_counter() - began)
         known = labels.template >= 0
         found = labels.template[known].astype(np.int64)

@@ -12,6 +12,8 @@ from scipy.sparse.csgraph import connected_components
 from src.geometry.mesh import Mesh, MeshError
 from src.geometry.resample import without_repeats
 
+HOLE = 0.1  # over the square root of the area: the radius of a sphere around what is closed
+
 
 class Repaired(NamedTuple):
     """A mesh; place int64 [V], for every vertex as it was one of the mesh, or -1; and what was
@@ -28,8 +30,9 @@ def repair(vertices: np.ndarray, faces: np.ndarray, name: str) -> Repaired:
     vertices: float [V, 3]. faces: int [F, 3]. In this order: faces go that name a vertex that is
     not there or not finite, or one vertex twice, and faces that repeat another; vertices at one
     place become one, faces without area by that go too; the surface is cut open along edges with
-    more than two faces; faces are turned to agree with their neighbours, and along edges where they
-    can't the surface is cut open as well. Holes stay. Errors: MeshError if no face is left.
+    more than two faces; holes no larger than HOLE are closed, without new vertices; faces are
+    turned to agree with their neighbours, and along edges where they can't the surface is cut open
+    as well. Errors: MeshError if no face is left.
     """
     vertices = np.array(vertices, dtype=np.float64)
     faces = np.array(faces, dtype=np.int64).reshape(-1, 3)
@@ -67,6 +70,9 @@ def repair(vertices: np.ndarray, faces: np.ndarray, name: str) -> Repaired:
     vertices[~finite] = 0.0
     vertices, faces, origin, cuts = cut_open(vertices, faces, crowded(faces))
     note(cuts, "edges with more than two faces cut open")
+    before = len(faces)
+    faces = closed(vertices, faces)
+    note(len(faces) - before, "faces put into holes")
     wound = trimesh.Trimesh(vertices, faces, process=False)
     trimesh.repair.fix_winding(wound)
     turned = np.asarray(wound.faces, dtype=np.int64)
@@ -80,6 +86,25 @@ def repair(vertices: np.ndarray, faces: np.ndarray, name: str) -> Repaired:
     became[origin[used][::-1]] = np.arange(len(used))[::-1]  # of the copies of a vertex the first
     mesh = Mesh(vertices[used], faces.reshape(-1, 3), name)
     return Repaired(mesh, became[place], changes)
+
+
+def closed(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """The faces, and behind them others that close the small holes."""
+    import pyvista  # takes a second
+
+    corners = vertices[faces]
+    with np.errstate(over="ignore", invalid="ignore"):
+        normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        area = np.linalg.norm(normals, axis=1).sum() / 2
+    if not 0 < area < np.inf:
+        return faces
+    surface = pyvista.make_tri_mesh(vertices, faces).fill_holes(HOLE * np.sqrt(area))
+    filled = surface.triangulate().regular_faces.astype(np.int64)
+    filled[len(faces) :] = filled[len(faces) :, ::-1]  # VTK winds them along the boundary
+    filled = without_repeats(filled)
+    third = crowded(filled).any(axis=1)
+    third[: len(faces)] = False
+    return filled[~third]
 
 
 def crowded(faces: np.ndarray) -> np.ndarray:
