@@ -19,7 +19,7 @@ REFUSED = "refused.txt"
 CONTENTS = {
     "map.txt": "for every vertex of the source one of the target, -1 for none",
     "template.txt": "for every vertex of the source one of the template",
-    "match.npz": "both, for both meshes, with confidences and places on the template",
+    "match.npz target.npz": "the same, with confidences and places on the template",
     "source.ply target.ply": "in colours: equal ones correspond",
     "transferred.npy transferred.ply transferred.obj": "what was carried over to the source",
     "correspondence.png confidence.png": "both from the front and the back",
@@ -72,6 +72,8 @@ def pair(config: DictConfig) -> Path:
     job = matches.Job.of(config)
     began = time.perf_counter()
     source = matches.one(job, config.source, folder)
+    if config.target:
+        matches.write_target(job, folder)
     for line in matches.told(source):
         log.info(line)
     if config.picture is not False:
@@ -95,7 +97,9 @@ def many(config: DictConfig) -> Path:
     folder = Path(config.output or Path("outputs", "matches", "sources"))
     meshes = named(config.sources)
     job = matches.Job.of(config)
-    job.target_labels()  # says what is wrong with it before the work begins
+    if config.target:
+        job.carried()  # what is wrong is said before the work begins
+        matches.write_target(job, folder)
     waiting = [(path, folder / name) for name, path in meshes.items()
                if not matches.done(job, path, folder / name)]  # fmt: skip
     if len(waiting) < len(meshes):

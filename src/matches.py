@@ -31,6 +31,8 @@ from src.render import RenderError, Row, render
 from src.runs import BEST, write_whole
 
 FILE = "match.npz"
+OURS = (FILE, "map.txt", "template.txt", "source.ply", "transferred.npy", "transferred.ply",
+        "transferred.obj", "correspondence.png", "confidence.png")  # fmt: skip
 
 log = logging.getLogger("src.matches")
 
@@ -80,13 +82,13 @@ class Job:
     def target_labels(self) -> Side | None:
         return _target(self) if self.target else None
 
+    def carried(self) -> np.ndarray | None:
+        """What is to be carried over, of the target's vertices."""
+        return _carried(self) if self.transfer else None
+
     def key(self, path: str) -> str:
         """The same as long as mesh, target, network and settings are."""
-        files = [path, Path(self.run) / BEST, *filter(None, [self.target])]
-        if self.transfer and self.transfer not in KINDS:
-            files.append(self.transfer)
-        settings = self.repair, self.resample, self.smooth, self.transfer
-        return digest(*(_content(str(file)) for file in files), *settings)
+        return digest(_content(path), _common(self))
 
 
 @cache
@@ -98,6 +100,20 @@ def _matcher(run: str, accelerator: str, resampled: bool | None, smooth: bool) -
 def _target(job: Job) -> Side:
     scan = open_scan(job.target, job.repair)
     return Side(scan, job.matcher().label(scan))
+
+
+@cache
+def _carried(job: Job) -> np.ndarray:
+    return read_attribute(job.target, job.transfer, len(job.target_labels().scan.vertices))
+
+
+@cache
+def _common(job: Job) -> str:
+    files = [str(Path(job.run) / BEST), *filter(None, [job.target])]
+    if job.transfer and job.transfer not in KINDS:
+        files.append(job.transfer)
+    settings = job.repair, job.resample, job.smooth, job.transfer
+    return digest(*(_content(file) for file in files), *settings)
 
 
 def _content(path: str) -> str:
@@ -125,40 +141,41 @@ def attempt(job: Job, path: str, folder: Path, processes: int) -> tuple[str, str
     try:
         one(job, path, folder)
         return path, None
-    except (MeshError, DataError, OSError) as error:
+    except (MeshError, DataError) as error:
         return path, str(error)
 
 
 def one(job: Job, path: str, folder: Path) -> Matched:
-    """Match a mesh and write what it gives. Errors: MeshError, DataError."""
-    scan = open_scan(path, job.repair)
-    carried = None
-    if job.transfer:
-        vertices = len(job.target_labels().scan.vertices)
-        carried = read_attribute(job.target, job.transfer, vertices)
+    """Match a mesh and write what it gives. Errors: MeshError, DataError; OSError from writing."""
+    scan, carried, target = open_scan(path, job.repair), job.carried(), job.target_labels()
     source = Side(scan, job.matcher().label(scan))
-    target = job.target_labels()
     found = Matched(source, target, nearest(source.labels, target.labels) if target else None)
     folder.mkdir(parents=True, exist_ok=True)
+    for old in OURS:
+        (folder / old).unlink(missing_ok=True)
     template = job.matcher().template
-    (folder / FILE).unlink(missing_ok=True)  # comes last: then all is there
-    arrays = {f"source_{k}": v for k, v in source.labels._asdict().items()}
+    arrays = source.labels._asdict()
     colors = place_colors(template, source.labels.points)
     if target:
-        arrays |= {f"target_{k}": v for k, v in target.labels._asdict().items()}
         arrays["map"] = found.map
         _write_lines(folder / "map.txt", found.map)
-        theirs = place_colors(template, target.labels.points)
-        colors = taken(found.map, theirs, 0.6)
-        _write_colored(folder / "target.ply", target.scan, theirs)
+        colors = taken(found.map, place_colors(template, target.labels.points), 0.6)
     _write_lines(folder / "template.txt", source.labels.template)
     _write_colored(folder / "source.ply", scan, colors)
     if carried is not None:
         _write_carried(folder, scan, taken(found.map, carried, 0), job.transfer)
-    whole = io.BytesIO()
-    np.savez_compressed(whole, key=np.array(job.key(path)), **arrays)
-    write_whole(folder / FILE, whole.getvalue())
+    _write_arrays(
+        folder / FILE, key=np.array(job.key(path)), **arrays
+    )  # the last: now all is there
     return found
+
+
+def write_target(job: Job, folder: Path) -> None:
+    """target.npz and target.ply, which are the same for all sources."""
+    scan, labels = job.target_labels()
+    folder.mkdir(parents=True, exist_ok=True)
+    _write_arrays(folder / "target.npz", **labels._asdict())
+    _write_colored(folder / "target.ply", scan, place_colors(job.matcher().template, labels.points))
 
 
 def taken(match: np.ndarray, values: np.ndarray, nothing: float) -> np.ndarray:
@@ -220,6 +237,12 @@ def standing(side: Side, template: Mesh) -> Mesh:
     weights = side.of_mesh(side.labels.confidence) + 1e-6
     turn, _ = Rotation.align_vectors(points - points.mean(axis=0), scaled, weights)
     return Mesh(turn.apply(scaled), mesh.faces, mesh.name)
+
+
+def _write_arrays(path: Path, **arrays: np.ndarray) -> None:
+    whole = io.BytesIO()
+    np.savez_compressed(whole, **arrays)
+    write_whole(path, whole.getvalue())
 
 
 def _write_lines(path: Path, numbers: np.ndarray) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import signal
 import subprocess
@@ -17,11 +18,12 @@ import trimesh
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from src import matches
 from src.data.scans import open_scan, scan
 from src.geometry.mesh import MeshError
 from src.match import main, named
 from src.matching import Labels, Matcher, nearest
-from src.runs import BEST, RunError
+from src.runs import BEST, RunError, write_whole
 from tests.conftest import toy_shapes
 from tests.damage import damaged_file
 from tests.test_cli import cli  # noqa: F401
@@ -163,13 +165,13 @@ def test_a_pair_is_matched_and_written(cli, trained, files):  # noqa: F811
     code, out, err = cli("source=a.ply", "target=b.ply", f"run={trained}", program=main)
     assert code == 0, err
     folder = files / "outputs/matches/a_to_b"
-    assert {p.name for p in folder.iterdir()} >= {"map.txt", "template.txt", "match.npz",
-                                                  "source.ply", "target.ply"}  # fmt: skip
+    expected = {"map.txt", "template.txt", "match.npz", "source.ply", "target.npz", "target.ply"}
+    assert {path.name for path in folder.iterdir()} >= expected
     match = np.loadtxt(folder / "map.txt", dtype=int)
     with np.load(folder / "match.npz", allow_pickle=False) as file:
         np.testing.assert_array_equal(file["map"], match)
         np.testing.assert_array_equal(
-            file["source_template"], np.loadtxt(folder / "template.txt", dtype=int)
+            file["template"], np.loadtxt(folder / "template.txt", dtype=int)
         )
     source, target = (
         trimesh.load(folder / f"{x}.ply", process=False) for x in ("source", "target")
@@ -239,7 +241,8 @@ def test_many_are_matched_and_those_done_are_skipped(cli, trained, files):  # no
     assert "broken.ply: not a readable PLY" in Path("out/refused.txt").read_text()
     assert "3 meshes matched" in out
     files_of = sorted(p.name for p in Path("out/0").iterdir())
-    assert files_of == ["map.txt", "match.npz", "source.ply", "target.ply", "template.txt"]
+    assert files_of == ["map.txt", "match.npz", "source.ply", "template.txt"]
+    assert Path("out/target.npz").exists() and Path("out/target.ply").exists()
     when = {i: os.stat(f"out/{i}/match.npz").st_mtime_ns for i in range(3)}
     Path("scans/broken.ply").unlink()
     Path("out/2/match.npz").write_bytes(b"half")
@@ -250,6 +253,30 @@ def test_many_are_matched_and_those_done_are_skipped(cli, trained, files):  # no
     assert [after[i] == when[i] for i in range(3)] == [True, True, False]
     code, out, _ = cli(*common, "smooth=true", program=main)  # another question
     assert code == 0 and "3 meshes matched" in out
+    code, out, _ = cli(common[0], *common[2:], program=main)
+    assert code == 0 and "3 meshes matched" in out and not Path("out/0/map.txt").exists()
+
+
+def test_a_full_disk_ends_the_command_and_loses_nothing(cli, trained, files, monkeypatch):  # noqa: F811
+    (files / "scans").mkdir()
+    for i in range(3):
+        mesh = TOYS[f"test/{i}.ply"]
+        trimesh.Trimesh(mesh.vertices, mesh.faces, process=False).export(f"scans/{i}.ply")
+    common = ["sources='scans/*'", f"run={trained}", "output=out", "workers=1"]
+    written = []
+
+    def write(path, content):
+        written.append(path)
+        if len(written) > 4:
+            raise OSError(errno.ENOSPC, "No space left on device", str(path))
+        write_whole(path, content)
+
+    monkeypatch.setattr(matches, "write_whole", write)
+    code, out, err = cli(*common, program=main)
+    assert code == 1 and "No space left on device" in out and "Traceback" not in out + err
+    monkeypatch.setattr(matches, "write_whole", write_whole)
+    code, out, _ = cli(*common, program=main)
+    assert code == 0 and "1 of 3 are done already" in out and "2 meshes matched" in out
 
 
 def test_meshes_of_one_name_get_folders_of_their_own(tmp_path, monkeypatch):
@@ -306,7 +333,7 @@ def test_a_killed_command_goes_on_where_it_was(trained, files):
     assert done - 1 <= told <= done  # at most the one in hand was lost
     for path in files.glob("out/*/match.npz"):
         with np.load(path, allow_pickle=False) as file:
-            assert file["source_template"].shape == (162,)
+            assert file["template"].shape == (162,)
     assert len(list(files.glob("out/*/match.npz"))) == 40
 
 

@@ -34,8 +34,10 @@ def repair(vertices: np.ndarray, faces: np.ndarray, name: str) -> Repaired:
     turned to agree with their neighbours, and along edges where they can't the surface is cut open
     as well. Errors: MeshError if no face is left.
     """
-    vertices = np.array(vertices, dtype=np.float64)
-    faces = np.array(faces, dtype=np.int64).reshape(-1, 3)
+    vertices, faces = np.array(vertices, dtype=np.float64), np.array(faces, dtype=np.int64)
+    for array, what in ((vertices, "vertices"), (faces, "faces")):
+        if array.ndim != 2 or array.shape[1] != 3:
+            raise MeshError(f"{name}: {what} must have three columns, got {array.shape}")
     changes: list[str] = []
 
     def note(count: int, what: str) -> None:

@@ -94,6 +94,13 @@ def test_a_moebius_strip_is_cut_open_once():
     assert len(found.mesh.faces) == 2 * n
 
 
+def test_arrays_of_another_shape_are_refused():
+    with pytest.raises(MeshError, match=r"vertices must have three columns, got \(162, 2\)"):
+        repair(SPHERE.vertices[:, :2], SPHERE.faces, "a")
+    with pytest.raises(MeshError, match=r"faces must have three columns, got \(320, 2\)"):
+        repair(SPHERE.vertices, SPHERE.faces[:, :2], "a")
+
+
 def test_a_mesh_without_a_usable_face_is_refused():
     with pytest.raises(MeshError, match="a: no face that can be used"):
         repair(np.full((3, 3), np.nan), np.array([[0, 1, 2]]), "a")
