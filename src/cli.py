@@ -97,6 +97,9 @@ def one_line(error: BaseException) -> str:
                 extra = "; others need pip install -e '.[parallel,cluster]'"
                 hint = extra if "hydra/launcher" in lines[0] else ""
                 return f"{lines[0]}; there are: {', '.join(options)}{hint}"
+        if lines[0].startswith(("mismatched input", "token recognition", "no viable")):
+            hint = "; a value with = or spaces needs quotes of its own: \"source='a b=c.ply'\""
+            return lines[0] + hint
         cause = error.__cause__
         reason = f" ({str(cause).splitlines()[0]})" if cause is not None and str(cause) else ""
         return lines[0] + reason

@@ -18,6 +18,7 @@ from src.runs import write_whole
 REFUSED = "refused.txt"
 CONTENTS = {
     "map.txt": "for every vertex of the source one of the target, -1 for none",
+    "remarks.txt": "what there was to say of the meshes",
     "template.txt": "for every vertex of the source one of the template",
     "match.npz target.npz": "the same, with confidences and places on the template",
     "source.ply target.ply": "in colours: equal ones correspond",
@@ -46,6 +47,9 @@ class Match:
 
 def check(config: DictConfig) -> DictConfig:
     found = typed(config, Match)
+    for key in ("source", "sources", "target", "run", "output", "transfer"):
+        if found[key] == "":
+            raise ConfigError(f"{key}= is empty; leave it out, or give a path")
     if (found.source is None) == (found.sources is None):
         raise ConfigError("give source=, a mesh, or sources=, a pattern such as 'scans/*.ply'")
     if found.transfer and not found.target:
@@ -69,15 +73,13 @@ def pair(config: DictConfig) -> Path:
     if config.target:
         name += f"_to_{Path(config.target).stem}"
     folder = Path(config.output or Path("outputs", "matches", name))
-    job = matches.Job.of(config)
+    job = matches.Job.of(config, picture=config.picture is not False)
     began = time.perf_counter()
-    source = matches.one(job, config.source, folder)
+    found = matches.one(job, config.source, folder)
     if config.target:
         matches.write_target(job, folder)
-    for line in matches.told(source):
+    for line in matches.told(found):
         log.info(line)
-    if config.picture is not False:
-        matches.draw(folder, job, source)
     for names, what in CONTENTS.items():
         there = [name for name in names.split() if (folder / name).exists()]
         if there:
@@ -88,38 +90,45 @@ def pair(config: DictConfig) -> Path:
 
 def many(config: DictConfig) -> Path:
     """Match every mesh of a pattern, each in a folder of its own; finished ones are left as they
-    are. Errors: DataError if no mesh could be used."""
+    are. Errors: DataError if a mesh could not be used, or a process was killed."""
     from joblib import Parallel, cpu_count, delayed
+    from joblib.externals.loky.process_executor import TerminatedWorkerError
     from tqdm import tqdm
 
     from src import matches
+    from src.sweeps import legal_name
 
-    folder = Path(config.output or Path("outputs", "matches", "sources"))
-    meshes = named(config.sources)
-    job = matches.Job.of(config)
+    folder = Path(config.output or Path("outputs", "matches", legal_name(config.sources)))
+    meshes = named(config.sources, folder)
+    job = matches.Job.of(config, picture=bool(config.picture))
     if config.target:
         job.carried()  # what is wrong is said before the work begins
         matches.write_target(job, folder)
+    else:
+        for old in matches.TARGET:
+            (folder / old).unlink(missing_ok=True)
     waiting = [(path, folder / name) for name, path in meshes.items()
                if not matches.done(job, path, folder / name)]  # fmt: skip
     if len(waiting) < len(meshes):
         log.info("%d of %d are done already", len(meshes) - len(waiting), len(meshes))
     workers = min(config.workers or cpu_count(), max(1, len(waiting)))
     refused: dict[str, str] = {}
+    mended = 0
     began = time.perf_counter()
     pool = Parallel(n_jobs=workers, return_as="generator_unordered", pre_dispatch="2 * n_jobs")
     work = pool(delayed(matches.attempt)(job, *each, workers) for each in waiting)
-    for path, reason in tqdm(work, total=len(waiting), desc="Matching", unit="mesh"):
-        if reason:
-            refused[path] = reason
-            tqdm.write(f"refused: {reason}")
-    if config.picture:
-        for path, place in waiting:
-            if path not in refused:
-                matches.draw(place, job, matches.one(job, path, place))
+    try:
+        for done in tqdm(work, total=len(waiting), desc="Matching", unit="mesh"):
+            mended += done.mended
+            if done.refused:
+                refused[done.path] = done.refused
+                tqdm.write(f"refused: {done.refused}")
+    except TerminatedWorkerError as error:
+        raise DataError("a process was killed, probably for lack of memory: workers=1 needs less; "
+                        "the same command goes on") from error  # fmt: skip
     seconds = time.perf_counter() - began
-    log.info("%d meshes matched in %.1f s, %d refused", len(waiting) - len(refused), seconds,
-             len(refused))  # fmt: skip
+    log.info("%d meshes matched in %.1f s, %d of them mended (see remarks.txt), %d refused",
+             len(waiting) - len(refused), seconds, mended, len(refused))  # fmt: skip
     folder.mkdir(parents=True, exist_ok=True)
     (folder / REFUSED).unlink(missing_ok=True)
     if refused:
@@ -129,21 +138,28 @@ def many(config: DictConfig) -> Path:
     return folder
 
 
-def named(pattern: str) -> dict[str, str]:
-    """The mesh files that a pattern finds, by names that differ. Errors: DataError for none."""
+def named(pattern: str, output: Path) -> dict[str, str]:
+    """The mesh files that a pattern finds, by names that differ; what lies in the folder to write
+    to is left out. Errors: DataError for none."""
     import glob
 
     from src.geometry.mesh import SUFFIXES
 
     found = sorted(path for path in glob.glob(pattern, recursive=True)
-                   if path.lower().endswith(SUFFIXES) and os.path.isfile(path))  # fmt: skip
+                   if path.lower().endswith(SUFFIXES) and os.path.isfile(path)
+                   and not Path(path).resolve().is_relative_to(output.resolve()))  # fmt: skip
     if not found:
         raise DataError(f"sources: {pattern!r} matches no mesh file ({', '.join(SUFFIXES)})")
     above = os.path.commonpath([os.path.dirname(os.path.abspath(path)) for path in found])
     names = [os.path.relpath(os.path.abspath(path), above).replace(os.sep, "_") for path in found]
     stems = [os.path.splitext(name)[0] for name in names]
-    return {stem if stems.count(stem) == 1 else name: path
-            for stem, name, path in zip(stems, names, found, strict=True)}  # fmt: skip
+    result: dict[str, str] = {}
+    for stem, name, path in zip(stems, names, found, strict=True):
+        name = stem if stems.count(stem) == 1 else name
+        while name in result:
+            name += "_"
+        result[name] = path
+    return result
 
 
 if __name__ == "__main__":

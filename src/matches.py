@@ -31,8 +31,9 @@ from src.render import RenderError, Row, render
 from src.runs import BEST, write_whole
 
 FILE = "match.npz"
-OURS = (FILE, "map.txt", "template.txt", "source.ply", "transferred.npy", "transferred.ply",
-        "transferred.obj", "correspondence.png", "confidence.png")  # fmt: skip
+TARGET = ("target.npz", "target.ply")
+OURS = (FILE, "map.txt", "template.txt", "remarks.txt", "source.ply", "transferred.npy",
+        "transferred.ply", "transferred.obj", "correspondence.png", "confidence.png")  # fmt: skip
 
 log = logging.getLogger("src.matches")
 
@@ -45,10 +46,7 @@ class Side(NamedTuple):
 
     def of_mesh(self, values: np.ndarray) -> np.ndarray:
         """Values [V, ...] of the user's vertices as those of the vertices of `scan.mesh`."""
-        one = np.zeros(len(self.scan.mesh.vertices), dtype=np.int64)
-        there = np.flatnonzero(self.scan.place >= 0)
-        one[self.scan.place[there]] = there
-        return values[one]
+        return values[self.scan.origin]
 
 
 class Matched(NamedTuple):
@@ -70,11 +68,12 @@ class Job:
     smooth: bool
     transfer: str | None
     accelerator: str
+    picture: bool
 
     @classmethod
-    def of(cls, config: DictConfig) -> Job:
+    def of(cls, config: DictConfig, picture: bool) -> Job:
         return cls(str(config.run or SHIPPED), config.target, config.repair, config.resample,
-                   config.smooth, config.transfer, config.accelerator)  # fmt: skip
+                   config.smooth, config.transfer, config.accelerator, picture)  # fmt: skip
 
     def matcher(self) -> Matcher:
         return _matcher(self.run, self.accelerator, self.resample, self.smooth)
@@ -112,7 +111,7 @@ def _common(job: Job) -> str:
     files = [str(Path(job.run) / BEST), *filter(None, [job.target])]
     if job.transfer and job.transfer not in KINDS:
         files.append(job.transfer)
-    settings = job.repair, job.resample, job.smooth, job.transfer
+    settings = job.repair, job.resample, job.smooth, job.transfer, job.picture
     return digest(*(_content(file) for file in files), *settings)
 
 
@@ -127,22 +126,34 @@ def done(job: Job, path: str, folder: Path) -> bool:
     """Whether the folder holds the match of that mesh, whole."""
     try:
         with np.load(folder / FILE, allow_pickle=False) as file:
-            return str(file["key"]) == job.key(path)
+            return str(file["key"]) == job.key(path) and str(file["source"]) == _absolute(path)
     except Exception:  # whatever numpy says of a file that is not there, or not whole
         return False
 
 
-def attempt(job: Job, path: str, folder: Path, processes: int) -> tuple[str, str | None]:
-    """`one` in a process of several; the path, and in words why the mesh was refused."""
+class Attempt(NamedTuple):
+    """refused: in words, why; or None. mended: whether something of the mesh was changed."""
+
+    path: str
+    refused: str | None
+    mended: bool
+
+
+def attempt(job: Job, path: str, folder: Path, processes: int) -> Attempt:
+    """`one` in a process of several."""
     import torch
 
     if processes > 1:
         torch.set_num_threads(1)
     try:
-        one(job, path, folder)
-        return path, None
+        found = one(job, path, folder)
     except (MeshError, DataError) as error:
-        return path, str(error)
+        return Attempt(path, str(error), False)
+    return Attempt(path, None, any("mended" in line for line in found.source.scan.remarks))
+
+
+def _absolute(path: str) -> str:
+    return str(Path(path).resolve())
 
 
 def one(job: Job, path: str, folder: Path) -> Matched:
@@ -150,8 +161,8 @@ def one(job: Job, path: str, folder: Path) -> Matched:
     scan, carried, target = open_scan(path, job.repair), job.carried(), job.target_labels()
     source = Side(scan, job.matcher().label(scan))
     found = Matched(source, target, nearest(source.labels, target.labels) if target else None)
-    folder.mkdir(parents=True, exist_ok=True)
-    for old in OURS:
+    _claim(folder, path)
+    for old in OURS if target else OURS + TARGET:
         (folder / old).unlink(missing_ok=True)
     template = job.matcher().template
     arrays = source.labels._asdict()
@@ -161,13 +172,27 @@ def one(job: Job, path: str, folder: Path) -> Matched:
         _write_lines(folder / "map.txt", found.map)
         colors = taken(found.map, place_colors(template, target.labels.points), 0.6)
     _write_lines(folder / "template.txt", source.labels.template)
+    write_whole(folder / "remarks.txt", "\n".join(told(found)) + "\n")
     _write_colored(folder / "source.ply", scan, colors)
     if carried is not None:
         _write_carried(folder, scan, taken(found.map, carried, 0), job.transfer)
-    _write_arrays(
-        folder / FILE, key=np.array(job.key(path)), **arrays
-    )  # the last: now all is there
+    if job.picture:
+        draw(folder, job, found)
+    names = {"key": np.array(job.key(path)), "source": np.array(_absolute(path))}
+    _write_arrays(folder / FILE, **names, **arrays)  # the last: now all is there
     return found
+
+
+def _claim(folder: Path, path: str) -> None:
+    """Errors: DataError if the folder holds the match of another mesh."""
+    folder.mkdir(parents=True, exist_ok=True)
+    try:
+        with np.load(folder / FILE, allow_pickle=False) as file:
+            other = str(file["source"])
+    except Exception:  # whatever numpy says of a file that is not there, or not whole
+        return
+    if other != _absolute(path):
+        raise DataError(f"{folder} holds the match of {other}; choose another with output=")
 
 
 def write_target(job: Job, folder: Path) -> None:
@@ -232,10 +257,11 @@ def draw(folder: Path, job: Job, found: Matched) -> None:
 def standing(side: Side, template: Mesh) -> Mesh:
     """The mesh turned and scaled to stand as the template does (Kabsch 1976)."""
     mesh, points = side.scan.mesh, side.of_mesh(side.labels.points)
-    scaled = mesh.vertices - mesh.vertices.mean(axis=0)
-    scaled *= np.sqrt(template.area / mesh.area)
     weights = side.of_mesh(side.labels.confidence) + 1e-6
-    turn, _ = Rotation.align_vectors(points - points.mean(axis=0), scaled, weights)
+    scaled = mesh.vertices * np.sqrt(template.area / mesh.area)
+    scaled -= np.average(scaled, axis=0, weights=weights)
+    there = points - np.average(points, axis=0, weights=weights)
+    turn, _ = Rotation.align_vectors(there, scaled, weights)
     return Mesh(turn.apply(scaled), mesh.faces, mesh.name)
 
 

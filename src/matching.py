@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+import torch
 from omegaconf import OmegaConf
 from scipy.spatial import cKDTree
 
@@ -118,11 +119,14 @@ class Matcher:
         described, neighbourhoods = (task.compute(*task.arguments) for task in tasks)
         batch = described_tensors(described, mesh, self._recipe)
         batch |= neighbourhood_tensors(neighbourhoods, mesh, self._recipe)
-        found = self._predictor({**batch, "index": 0}, "evaluation")
-        template, confidence = found.classes.cpu().numpy(), found.probability.float().cpu().numpy()
+        batch["index"] = 0
+        found = self._predictor(batch, "evaluation")
+        template, confidence = found.classes.cpu().numpy(), found.probability
         if self._smooth:
             template = zoomout(*eigenfunctions(mesh, TO), self._eigenfunctions, template)
-        return template, confidence
+            batch["labels"] = torch.from_numpy(template)
+            confidence = self._predictor(batch, "evaluation").of_label
+        return template, confidence.float().cpu().numpy()
 
     def _blend(self, corners: np.ndarray, weights: np.ndarray, most: np.ndarray) -> np.ndarray:
         """float64 [V, 3]: points on the template, between those of the corners [V, 3] of a face; a
@@ -140,7 +144,7 @@ class Matcher:
 
     @cached_property
     def _eigenfunctions(self) -> np.ndarray:
-        return eigenfunctions(self.template, TO)[0]
+        return eigenfunctions(unit(self.template), TO)[0]  # of one scale with those of the meshes
 
 
 def nearest(source: Labels, target: Labels) -> np.ndarray:

@@ -20,7 +20,7 @@ from hypothesis import strategies as st
 
 from src import matches
 from src.data.scans import open_scan, scan
-from src.geometry.mesh import MeshError
+from src.geometry.mesh import Mesh, MeshError
 from src.match import main, named
 from src.matching import Labels, Matcher, nearest
 from src.runs import BEST, RunError, write_whole
@@ -127,6 +127,24 @@ def test_smoothing_lowers_the_error(trained):
     assert error(smooth=True) < error()
 
 
+def test_the_templates_unit_does_not_matter_to_smoothing(trained):
+    found = []
+    for scale in (1, 1000):
+        matcher = Matcher.load(trained, smooth=True)
+        template = matcher.template
+        matcher.template = Mesh(scale * template.vertices, template.faces)
+        found.append(matcher.label(scanned(SOURCE)).template)
+    np.testing.assert_array_equal(*found)
+
+
+def test_confidence_is_that_of_the_label_after_smoothing_too(trained):
+    plain, smooth = (Matcher.load(trained, smooth=x).label(scanned(SOURCE)) for x in (False, True))
+    same = plain.template == smooth.template
+    assert 0 < same.mean() < 1
+    np.testing.assert_allclose(smooth.confidence[same], plain.confidence[same], rtol=1e-4)
+    assert (smooth.confidence[~same] <= plain.confidence[~same]).all()
+
+
 def test_a_vertex_without_a_face_gets_no_match(matcher):
     vertices = np.concatenate([[[1e30, 0, 0]], SOURCE.vertices])
     found = matcher.label(scan(vertices, SOURCE.faces + 1, "a"))
@@ -228,6 +246,36 @@ def test_the_map_is_of_the_users_vertices_after_a_repair(cli, trained, files):  
     assert "5 vertices joined with others" in out
 
 
+def test_what_a_repair_cut_open_is_drawn(cli, trained, files):  # noqa: F811
+    """The first vertex is on no face; others were doubled."""
+    vertices = np.concatenate([[[np.nan, 0, 0]], SOURCE.vertices, [[3, 3, 3]]])
+    faces = np.concatenate(
+        [SOURCE.faces + 1, [[SOURCE.faces[0, 0] + 1, SOURCE.faces[0, 1] + 1, 163]]]
+    )
+    trimesh.Trimesh(vertices, faces, process=False).export("a.ply")
+    code, out, err = cli(
+        "source=a.ply", f"run={trained}", "repair=true", "output=out", program=main
+    )
+    assert code == 0 and "cut open" in out, out + err
+    assert Path("out/correspondence.png").exists()
+    sources = ["sources=a.ply", f"run={trained}", "repair=true", "output=many", "workers=1"]
+    code, out, _ = cli(*sources, program=main)
+    assert code == 0 and "1 of them mended" in out
+    assert "cut open" in Path("many/a/remarks.txt").read_text()
+    code, out, _ = cli(*sources, "picture=true", program=main)
+    assert code == 0 and Path("many/a/correspondence.png").exists()
+
+
+def test_results_are_no_sources_and_are_not_overwritten_by_others(cli, trained, files):  # noqa: F811
+    common = ["sources='**/*.ply'", f"run={trained}", "workers=1", "output=out"]
+    assert cli(*common, program=main)[0] == 0
+    code, out, _ = cli(*common, program=main)
+    assert code == 0 and "2 of 2 are done already" in out
+    Path("b.ply").rename("c.ply")
+    code, out, _ = cli("source=c.ply", f"run={trained}", "output=out/b", program=main)
+    assert code == 1 and "holds the match of" in out and "b.ply" in out
+
+
 def test_many_are_matched_and_those_done_are_skipped(cli, trained, files):  # noqa: F811
     (files / "scans").mkdir()
     for i in range(3):
@@ -240,8 +288,9 @@ def test_many_are_matched_and_those_done_are_skipped(cli, trained, files):  # no
     assert code == 1 and "1 of 4 meshes were refused; out/refused.txt" in out
     assert "broken.ply: not a readable PLY" in Path("out/refused.txt").read_text()
     assert "3 meshes matched" in out
+    assert "0 of them mended" in out
     files_of = sorted(p.name for p in Path("out/0").iterdir())
-    assert files_of == ["map.txt", "match.npz", "source.ply", "template.txt"]
+    assert files_of == ["map.txt", "match.npz", "remarks.txt", "source.ply", "template.txt"]
     assert Path("out/target.npz").exists() and Path("out/target.ply").exists()
     when = {i: os.stat(f"out/{i}/match.npz").st_mtime_ns for i in range(3)}
     Path("scans/broken.ply").unlink()
@@ -255,9 +304,11 @@ def test_many_are_matched_and_those_done_are_skipped(cli, trained, files):  # no
     assert code == 0 and "3 meshes matched" in out
     code, out, _ = cli(common[0], *common[2:], program=main)
     assert code == 0 and "3 meshes matched" in out and not Path("out/0/map.txt").exists()
+    assert not Path("out/target.npz").exists()
 
 
-def test_a_full_disk_ends_the_command_and_loses_nothing(cli, trained, files, monkeypatch):  # noqa: F811
+def test_a_full_disk_ends_the_command(cli, trained, files, monkeypatch):  # noqa: F811
+    """And loses nothing that was finished."""
     (files / "scans").mkdir()
     for i in range(3):
         mesh = TOYS[f"test/{i}.ply"]
@@ -285,9 +336,11 @@ def test_meshes_of_one_name_get_folders_of_their_own(tmp_path, monkeypatch):
         path = tmp_path / name
         path.parent.mkdir(exist_ok=True)
         path.touch()
-    assert named("**/*") == {"x_a.ply": "x/a.ply", "x_a.obj": "x/a.obj", "y_a": "y/a.ply",
+    assert named("**/*", tmp_path / "out") == {"x_a.ply": "x/a.ply", "x_a.obj": "x/a.obj", "y_a": "y/a.ply",
                              "y_b": "y/b.stl"}  # fmt: skip
-    assert named("x/a.obj") == {"a": "x/a.obj"}
+    assert named("x/a.obj", tmp_path / "out") == {"a": "x/a.obj"}
+    (tmp_path / "x_a.ply").touch()
+    assert sorted(named("**/*a.ply", tmp_path / "y").values()) == ["x/a.ply", "x_a.ply"]
 
 
 @pytest.mark.parametrize(
@@ -295,6 +348,8 @@ def test_meshes_of_one_name_get_folders_of_their_own(tmp_path, monkeypatch):
     [
         ([], "give source=, a mesh, or sources="),
         (["source=a.ply", "sources=a.ply"], "give source=, a mesh, or sources="),
+        (["sources="], "sources= is empty"),
+        (["source=a.ply", "target="], "target= is empty"),
         (["source=none.ply"], "none.ply: No such file"),
         (["sources='none/*'"], "matches no mesh file"),
         (["source=a.ply", "transfer=color"], "give target="),

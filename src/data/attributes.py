@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from src.data.shapes import DataError
-from src.geometry.mesh import read_arrays
+from src.geometry.mesh import read_arrays, without_texture
 
 KINDS = ("color", "uv")
 
@@ -52,8 +52,11 @@ def _of_parts(path: Path, what: str) -> np.ndarray | None:
     import trimesh
 
     read_arrays(path)  # says what is wrong with the file
-    loaded = trimesh.load(io.BytesIO(path.read_bytes()), file_type=path.suffix.lower()[1:],
-                          process=False, maintain_order=True)  # fmt: skip
+    data = path.read_bytes()
+    if path.suffix.lower() == ".ply":
+        data = without_texture(data)
+    loaded = trimesh.load(io.BytesIO(data), file_type=path.suffix.lower()[1:], process=False,
+                          maintain_order=True)  # fmt: skip
     parts = [loaded]
     if hasattr(loaded, "geometry"):  # in the order of `read_arrays`
         names = [loaded.graph[node][1] for node in sorted(loaded.graph.nodes_geometry)]
@@ -75,7 +78,7 @@ def _visual(visual, what: str) -> np.ndarray | None:
 def _of_obj(path: Path, what: str) -> np.ndarray | None:
     vertices: list[list[str]] = []
     textures: list[list[str]] = []
-    first: dict[int, int] = {}
+    first: dict[int, int | None] = {}  # of each vertex of a face, its texture coordinates
     try:
         for line in path.read_text(encoding="utf-8", errors="replace").splitlines():
             kind, *words = line.split() or [""]
@@ -86,20 +89,24 @@ def _of_obj(path: Path, what: str) -> np.ndarray | None:
             elif kind == "f":
                 for corner in words:
                     one, texture = [*corner.split("/"), ""][:2]
-                    if texture:
-                        first.setdefault(_number(one, vertices), _number(texture, textures))
+                    place = _number(texture, textures) if texture else None
+                    first.setdefault(_number(one, vertices), place)
         if what == "color":
             if not all(len(vertex) >= 6 for vertex in vertices):
                 return None
             values = np.array([vertex[3:6] for vertex in vertices], dtype=float)
-            return np.round(255 * values.clip(0, 1)).astype(np.uint8)
-        if not first:
+            scale = 255 if values.max() <= 1 else 1  # some write 0..1, some 0..255
+            return np.round(scale * values).clip(0, 255).astype(np.uint8)
+        known = {vertex: place for vertex, place in first.items() if place is not None}
+        if not known:
             return None
         values = np.full((len(vertices), 2), np.nan)
-        values[list(first)] = np.array(textures, dtype=float)[list(first.values())]
-        return values
+        values[list(known)] = np.array(textures, dtype=float)[list(known.values())]
     except (ValueError, IndexError, OSError) as error:
         raise DataError(f"{path}: its {what} can't be read ({error})") from error
+    if missing := len(first) - len(known):
+        raise DataError(f"{path}: {missing:,} of the {len(first):,} vertices of faces have no uv")
+    return values
 
 
 def _number(word: str, things: list) -> int:

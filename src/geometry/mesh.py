@@ -163,6 +163,8 @@ def parse_arrays(data: bytes, suffix: str, name: str) -> tuple[np.ndarray, np.nd
     try:
         if suffix == ".obj":
             data = _only_vertices_and_faces(data)
+        if suffix == ".ply":
+            data = without_texture(data)
         loaded = trimesh.load(io.BytesIO(data), file_type=suffix[1:], process=False,
                               maintain_order=True)  # fmt: skip
         parts = _parts(loaded)
@@ -199,6 +201,14 @@ def _parts(loaded) -> list[tuple[np.ndarray, np.ndarray]]:
                 vertices = vertices @ matrix[:3, :3].T + matrix[:3, 3]
             parts.append((vertices, faces))
     return parts
+
+
+def without_texture(ply: bytes) -> bytes:
+    """A PLY whose faces' texture coordinates have another name: trimesh would give each corner of a
+    face a vertex of its own for them."""
+    end = ply.find(b"end_header")
+    header = ply[: max(end, 0)].replace(b"TextureFile", b"texture").replace(b"texcoord", b"corners")
+    return header + ply[max(end, 0) :]
 
 
 def _only_vertices_and_faces(obj: bytes) -> bytes:

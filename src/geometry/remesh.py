@@ -92,7 +92,8 @@ def closest_points(
 
     def consider(queries: np.ndarray, faces: np.ndarray, facing: float = FACING) -> None:
         """Of pairs [P] of a query and a face, ascending in the queries: keep what is nearer."""
-        agrees = np.einsum("px,px->p", normals[queries], directions[faces]) >= facing
+        # a vertex without a normal, NaN, agrees with all
+        agrees = ~(np.einsum("px,px->p", normals[queries], directions[faces]) < facing)
         least = np.linalg.norm(points[queries] - centres[faces], axis=1) - reach[faces]
         worth = agrees & (least < distance[queries])
         queries, faces = queries[worth], faces[worth]

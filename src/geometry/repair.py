@@ -12,15 +12,17 @@ from scipy.sparse.csgraph import connected_components
 from src.geometry.mesh import Mesh, MeshError
 from src.geometry.resample import without_repeats
 
+CLEARLY = 0.05
 HOLE = 0.1  # over the square root of the area: the radius of a sphere around what is closed
 
 
 class Repaired(NamedTuple):
-    """A mesh; place int64 [V], for every vertex as it was one of the mesh, or -1; and what was
-    changed, in words."""
+    """A mesh; place int64 [V], for every vertex as it was one of the mesh, or -1; origin int64 [W],
+    for every vertex of the mesh the one that it was; and what was changed, in words."""
 
     mesh: Mesh
     place: np.ndarray
+    origin: np.ndarray
     changes: list[str]
 
 
@@ -87,7 +89,33 @@ def repair(vertices: np.ndarray, faces: np.ndarray, name: str) -> Repaired:
     became = np.full(len(place) + 1, -1)
     became[origin[used][::-1]] = np.arange(len(used))[::-1]  # of the copies of a vertex the first
     mesh = Mesh(vertices[used], faces.reshape(-1, 3), name)
-    return Repaired(mesh, became[place], changes)
+    return Repaired(mesh, became[place], origin[used], changes)
+
+
+def outwards(mesh: Mesh) -> tuple[Mesh, int]:
+    """The mesh with those of its pieces turned that are inside out, and how many these are.
+
+    A piece is what edges hold together. It is inside out if the volume that it encloses with its
+    own centre is negative; where the piece has a boundary, clearly so: by more than CLEARLY of the
+    volume of a sphere with its area.
+    """
+    solid = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
+    pairs = solid.face_adjacency
+    graph = coo_array((np.ones(len(pairs)), tuple(pairs.T)), shape=(len(mesh.faces),) * 2)
+    count, piece = connected_components(graph, directed=False)
+    corners = mesh.vertices[mesh.faces]
+    sizes = np.bincount(piece, minlength=count)[:, None]
+    centres = np.stack(
+        [np.bincount(piece, x, minlength=count) for x in corners.mean(axis=1).T], axis=1
+    )
+    a, b, c = (corners - (centres / sizes)[piece][:, None]).transpose(1, 0, 2)
+    volume = np.bincount(piece, (a * np.cross(b, c)).sum(axis=1) / 6, minlength=count)
+    area = np.bincount(piece, np.linalg.norm(mesh.face_normals, axis=1) / 2, minlength=count)
+    closed = np.bincount(piece[pairs].ravel(), minlength=count) == 3 * sizes[:, 0]
+    sphere = area**1.5 / (6 * np.sqrt(np.pi))
+    inside_out = volume < np.where(closed, 0.0, -CLEARLY * sphere)
+    faces = np.where(inside_out[piece][:, None], mesh.faces[:, ::-1], mesh.faces)
+    return Mesh(mesh.vertices, faces, mesh.name), int(inside_out.sum())
 
 
 def closed(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:

@@ -39,7 +39,7 @@ def eigenfunctions(mesh: Mesh, count: int) -> tuple[np.ndarray, np.ndarray]:
 def zoomout(
     functions: np.ndarray, masses: np.ndarray, others: np.ndarray, match: np.ndarray
 ) -> np.ndarray:
-    """int64 [V]: the map with its noise gone. Both surfaces should be whole.
+    """int64 [V]: the map with its noise gone. Both surfaces should be whole, and of one area.
 
     functions, masses: of the surface that the map is from. others: float64 [K, TO], the functions
     of the one that it leads to. match: int64 [V], for every vertex one of the other surface.

@@ -65,11 +65,13 @@ class _LinearCrossEntropy(torch.autograd.Function):
 
 
 class Prediction(NamedTuple):
-    """classes int64 [V], of the largest score; probability float [V], the softmax of that score;
-    loss, as `linear_cross_entropy` gives it, or None without labels."""
+    """classes int64 [V], of the largest score; probability float [V], the softmax of that score.
+    With labels: of_label float [V], the softmax of theirs, and loss, as `linear_cross_entropy`
+    gives it; else None."""
 
     classes: Tensor
     probability: Tensor
+    of_label: Tensor | None
     loss: Tensor | None
 
 
@@ -81,7 +83,7 @@ def predict(x: Tensor, weight: Tensor, bias: Tensor, labels: Tensor | None = Non
     """
     classes = torch.empty(len(x), dtype=torch.int64, device=x.device)
     probability = torch.empty(len(x), dtype=weight.dtype, device=x.device)
-    loss = None if labels is None else torch.zeros((), dtype=weight.dtype, device=x.device)
+    losses = None if labels is None else torch.empty_like(probability)
     with torch.autocast(x.device.type, enabled=False):
         for start in range(0, len(x), ROWS):
             rows = slice(start, start + ROWS)
@@ -91,6 +93,8 @@ def predict(x: Tensor, weight: Tensor, bias: Tensor, labels: Tensor | None = Non
             right = None if labels is None else scores.gather(1, labels[rows, None])
             sums = scores.exp_().sum(1, keepdim=True)
             if right is not None:
-                loss += (sums.log() - right).sum()
+                losses[rows] = (sums.log() - right)[:, 0]
             classes[rows], probability[rows] = best[:, 0], 1 / sums[:, 0]
-    return Prediction(classes, probability, None if loss is None else loss / len(x))
+    if losses is None:
+        return Prediction(classes, probability, None, None)
+    return Prediction(classes, probability, (-losses).exp(), losses.mean())

@@ -48,6 +48,32 @@ def test_what_can_be_used_is_used_and_said(vertices, faces, remark):
 
 def test_a_surface_that_was_inside_out_faces_outwards():
     np.testing.assert_allclose(scan(V, F[:, ::-1], "a").mesh.face_normals, SPHERE.face_normals)
+    opened = scan(V, F[9:, ::-1], "a")
+    assert opened.remarks[0] == "1 pieces of the surface were inside out and have been turned"
+    np.testing.assert_allclose(opened.mesh.face_normals, SPHERE.face_normals[9:])
+
+
+def test_each_piece_is_turned_by_itself_and_a_sheet_is_left():
+    faces = np.concatenate([F, F[:, ::-1] + len(V)])
+    found = scan(np.concatenate([V, 0.3 * V + 9]), faces, "a")
+    assert "1 pieces of the surface were inside out and have been turned" in found.remarks
+    assert (found.mesh.face_normals[len(F) :] * SPHERE.face_normals > 0).any(axis=1).all()
+    sheet = lattice(5, 6)
+    for wound in (sheet.faces, sheet.faces[:, ::-1]):
+        np.testing.assert_array_equal(scan(sheet.vertices, wound, "a").mesh.faces, wound)
+
+
+def test_a_repair_that_follows_a_wrong_face_still_faces_outwards():
+    faces = F[20:].copy()
+    faces[:40] = faces[:40, ::-1]
+    found = scan(V, faces, "a", repair=True)
+    outward = found.mesh.face_normals[: len(faces)] * SPHERE.face_normals[20:]
+    assert (outward.sum(axis=1) > 0).all()
+
+
+def test_vertices_on_no_face_are_no_components():
+    found = scan(np.concatenate([V, [[5, 5, 5], [6, 6, 6]]]), F, "a")
+    assert found.remarks == ["2 of 164 vertices are on no face and get no match"]
 
 
 def test_what_cannot_be_used_says_what_would_mend_it():
@@ -147,6 +173,31 @@ def test_texture_coordinates_are_read_at_a_seam_the_first(tmp_path):
     visual = trimesh.visual.TextureVisuals(uv=uv)
     trimesh.Trimesh(V, F, visual=visual, process=False).export(tmp_path / "a.glb")
     np.testing.assert_allclose(read_attribute(tmp_path / "a.glb", "uv", len(V)), uv, atol=1e-6)
+
+
+def test_a_texture_does_not_give_a_ply_other_vertices(tmp_path):
+    rows = "\n".join(" ".join(map(str, v)) for v in V)
+    faces = "\n".join(f"3 {a} {b} {c} 6 0 0 1 0 0 1" for a, b, c in F)
+    (tmp_path / "a.ply").write_text(
+        "ply\nformat ascii 1.0\ncomment TextureFile a.png\n"
+        f"element vertex {len(V)}\nproperty float x\nproperty float y\nproperty float z\n"
+        f"element face {len(F)}\nproperty list uchar int vertex_indices\n"
+        f"property list uchar float texcoord\nend_header\n{rows}\n{faces}\n"
+    )
+    found = open_scan(tmp_path / "a.ply")
+    np.testing.assert_allclose(found.vertices, V)
+    np.testing.assert_array_equal(found.faces, F)
+    with pytest.raises(DataError, match="have no uv"):
+        read_attribute(tmp_path / "a.ply", "uv", len(V))
+
+
+def test_colours_of_an_obj_may_go_to_255_and_uv_may_be_missing(tmp_path):
+    path = tmp_path / "a.obj"
+    path.write_text("v 0 0 0 255 0 9\nv 1 0 0 0 0 0\nv 0 1 0 1 2 3\nv 2 2 2 1 1 1\nvt 0 0\n"
+                    "f 1/1 2/1 3/1\nf 2 4 3\n")  # fmt: skip
+    np.testing.assert_array_equal(read_attribute(path, "color", 4)[0], [255, 0, 9])
+    with pytest.raises(DataError, match="1 of the 4 vertices of faces have no uv"):
+        read_attribute(path, "uv", 4)
 
 
 def test_an_array_of_anything_is_read(tmp_path):

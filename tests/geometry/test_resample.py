@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from src.geometry.mesh import Mesh, MeshError
+from src.geometry.remesh import closest_points
 from src.geometry.resample import resample, surplus, without_repeats
 from tests.meshes import bumpy_sphere, lattice, punctured
 
@@ -48,3 +49,10 @@ def test_faces_that_are_none_go_and_repeated_ones_stay_once():
 def test_a_surface_that_would_vanish_is_refused():
     with pytest.raises(MeshError, match="nothing is left"):
         resample(Mesh(np.eye(3), np.array([[0, 1, 2]]), "a"), 3)
+
+
+def test_a_vertex_without_a_normal_still_has_a_closest_point():
+    points, nowhere = SPHERE.vertices[:3], np.full((3, 3), np.nan)
+    face, _, distance = closest_points(SPHERE, points, nowhere)
+    assert (distance < 1e-9).all()
+    assert all(vertex in SPHERE.faces[f] for vertex, f in enumerate(face))

@@ -66,9 +66,11 @@ def test_without_gradients_the_value_is_the_same(layer):
 def test_predict_is_the_argmax_and_the_loss(layer, rows, monkeypatch):
     monkeypatch.setattr(module, "ROWS", rows)
     x, weight, bias, labels = layer
-    classes, probability, loss = predict(*layer)
+    classes, probability, of_label, loss = predict(*layer)
     scores = F.linear(x, weight, bias)
     torch.testing.assert_close(classes, scores.argmax(1))
     torch.testing.assert_close(probability, scores.softmax(1).amax(1), rtol=0, atol=1e-12)
-    assert predict(*layer[:3]).loss is None
+    right = scores.softmax(1).gather(1, labels[:, None])[:, 0]
+    torch.testing.assert_close(of_label, right, rtol=0, atol=1e-12)
+    assert predict(*layer[:3]).loss is None and predict(*layer[:3]).of_label is None
     torch.testing.assert_close(loss, F.cross_entropy(scores, labels), rtol=0, atol=1e-12)
