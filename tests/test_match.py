@@ -336,8 +336,9 @@ def test_meshes_of_one_name_get_folders_of_their_own(tmp_path, monkeypatch):
         path = tmp_path / name
         path.parent.mkdir(exist_ok=True)
         path.touch()
-    assert named("**/*", tmp_path / "out") == {"x_a.ply": "x/a.ply", "x_a.obj": "x/a.obj", "y_a": "y/a.ply",
-                             "y_b": "y/b.stl"}  # fmt: skip
+    assert named("**/*", tmp_path / "out") == {
+        "x_a.ply": "x/a.ply", "x_a.obj": "x/a.obj", "y_a": "y/a.ply", "y_b": "y/b.stl"
+    }  # fmt: skip
     assert named("x/a.obj", tmp_path / "out") == {"a": "x/a.obj"}
     (tmp_path / "x_a.ply").touch()
     assert sorted(named("**/*a.ply", tmp_path / "y").values()) == ["x/a.ply", "x_a.ply"]
