@@ -115,7 +115,9 @@ def many(config: DictConfig) -> Path:
     refused: dict[str, str] = {}
     mended = 0
     began = time.perf_counter()
-    pool = Parallel(n_jobs=workers, return_as="generator_unordered", pre_dispatch="2 * n_jobs")
+    # idle workers would stay for five minutes if this process were killed, with their memory
+    pool = Parallel(n_jobs=workers, return_as="generator_unordered", pre_dispatch="2 * n_jobs",
+                    idle_worker_timeout=5)  # fmt: skip
     work = pool(delayed(matches.attempt)(job, *each, workers) for each in waiting)
     try:
         for done in tqdm(work, total=len(waiting), desc="Matching", unit="mesh"):
