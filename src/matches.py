@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-import io
 import logging
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
-import trimesh
 from omegaconf import DictConfig
 from scipy.spatial.transform import Rotation
 
@@ -18,6 +16,7 @@ from src.data.attributes import KINDS, read_attribute
 from src.data.scans import Scan, open_scan
 from src.data.shapes import DataError
 from src.data.store import digest
+from src.exports import write_arrays, write_carried, write_colored, write_lines
 from src.figures import (
     confidence_colors,
     encoded,
@@ -169,17 +168,17 @@ def one(job: Job, path: str, folder: Path) -> Matched:
     colors = place_colors(template, source.labels.points)
     if target:
         arrays["map"] = found.map
-        _write_lines(folder / "map.txt", found.map)
+        write_lines(folder / "map.txt", found.map)
         colors = taken(found.map, place_colors(template, target.labels.points), 0.6)
-    _write_lines(folder / "template.txt", source.labels.template)
+    write_lines(folder / "template.txt", source.labels.template)
     write_whole(folder / "remarks.txt", "\n".join(told(found)) + "\n")
-    _write_colored(folder / "source.ply", scan, colors)
+    write_colored(folder / "source.ply", scan, colors)
     if carried is not None:
-        _write_carried(folder, scan, taken(found.map, carried, 0), job.transfer)
+        write_carried(folder, scan, taken(found.map, carried, 0), job.transfer)
     if job.picture:
         draw(folder, job, found)
     names = {"key": np.array(job.key(path)), "source": np.array(_absolute(path))}
-    _write_arrays(folder / FILE, **names, **arrays)  # the last: now all is there
+    write_arrays(folder / FILE, **names, **arrays)  # the last: now all is there
     return found
 
 
@@ -199,8 +198,8 @@ def write_target(job: Job, folder: Path) -> None:
     """target.npz and target.ply, which are the same for all sources."""
     scan, labels = job.target_labels()
     folder.mkdir(parents=True, exist_ok=True)
-    _write_arrays(folder / "target.npz", **labels._asdict())
-    _write_colored(folder / "target.ply", scan, place_colors(job.matcher().template, labels.points))
+    write_arrays(folder / "target.npz", **labels._asdict())
+    write_colored(folder / "target.ply", scan, place_colors(job.matcher().template, labels.points))
 
 
 def taken(match: np.ndarray, values: np.ndarray, nothing: float) -> np.ndarray:
@@ -263,39 +262,3 @@ def standing(side: Side, template: Mesh) -> Mesh:
     there = points - np.average(points, axis=0, weights=weights)
     turn, _ = Rotation.align_vectors(there, scaled, weights)
     return Mesh(turn.apply(scaled), mesh.faces, mesh.name)
-
-
-def _write_arrays(path: Path, **arrays: np.ndarray) -> None:
-    whole = io.BytesIO()
-    np.savez_compressed(whole, **arrays)
-    write_whole(path, whole.getvalue())
-
-
-def _write_lines(path: Path, numbers: np.ndarray) -> None:
-    write_whole(path, "\n".join(map(str, numbers.tolist())) + "\n")
-
-
-def _mesh(scan: Scan, **visual: Any) -> trimesh.Trimesh:
-    """The user's own vertices, and those of their faces that can be drawn."""
-    faces = scan.faces[((scan.faces >= 0) & (scan.faces < len(scan.vertices))).all(axis=1)]
-    return trimesh.Trimesh(scan.vertices, faces, process=False, **visual)
-
-
-def _write_colored(path: Path, scan: Scan, colors: np.ndarray) -> None:
-    colored = _mesh(scan, vertex_colors=np.round(255 * colors).astype(np.uint8))
-    write_whole(path, colored.export(file_type="ply"))
-
-
-def _write_carried(folder: Path, scan: Scan, values: np.ndarray, what: str) -> None:
-    """transferred.npy, and with colours transferred.ply, with uv transferred.obj."""
-    whole = io.BytesIO()
-    np.save(whole, values)
-    write_whole(folder / "transferred.npy", whole.getvalue())
-    if what == "color":
-        write_whole(
-            folder / "transferred.ply", _mesh(scan, vertex_colors=values).export(file_type="ply")
-        )
-    if what == "uv":
-        textured = _mesh(scan, visual=trimesh.visual.TextureVisuals(uv=values))
-        text = trimesh.exchange.obj.export_obj(textured, include_normals=False, write_texture=False)
-        write_whole(folder / "transferred.obj", text)

@@ -106,7 +106,6 @@ def train(config: DictConfig, folder: Path) -> dict[str, float]:
             check(checkpoint, plain)
     trainer.fit(module, datamodule=data, weights_only=True,
                 ckpt_path=last if last.exists() else None)  # fmt: skip
-    trained = speed.seconds  # best.ckpt, loaded below, brings an earlier clock
     [tested] = trainer.test(module, datamodule=data, ckpt_path=folder / BEST, weights_only=True,
                             verbose=False)  # fmt: skip
     metrics = {
@@ -114,7 +113,7 @@ def train(config: DictConfig, folder: Path) -> dict[str, float]:
         **module.figures["val"],  # of best.ckpt, to choose settings by
         "parameters": parameters,
         "seconds/preprocess": seconds,
-        "seconds/train": trained,
+        "seconds/train": speed.seconds,
     }
     if trainer.is_global_zero:
         trainer.logger.log_hyperparams(flat(plain), tested)
@@ -127,7 +126,7 @@ def train(config: DictConfig, folder: Path) -> dict[str, float]:
         summary.draw(folder, module.curves, outcome, data, chosen)
         for line in summary.table(outcome, metrics):
             log.info(line)
-        log.info("Seconds:     %.1f preprocessing, %.1f training", seconds, trained)
+        log.info("Seconds:     %.1f preprocessing, %.1f training", seconds, speed.seconds)
         log.info("Run folder:  %s", folder)
         log.info("TensorBoard: tensorboard --logdir %s", folder)
     return metrics

@@ -70,18 +70,18 @@ def test_the_documented_line_works_word_for_word(cli, toy_overrides, tmp_path):
 
 def test_the_documented_sweep_works(cli, toy_overrides, tmp_path):
     toy = [o for o in toy_overrides if not o.startswith(("seq_len", "data.cache_dir"))]
-    sweep = ["-m", "model=lstm,fcs", "seq_len=5,6,7", "+metric=true,false"]
+    sweep = ["-m", "model=lstm,fcs", "seq_len=5,6", "+metric=true,false"]
     code, _, err = cli(*sweep, *toy, *QUICK, "hydra.sweep.dir=sweep")
     assert code == 0, err
     runs = [path.parent for path in (tmp_path / "sweep").glob("*/metrics.json")]
-    assert len(runs) == 12
+    assert len(runs) == 8
     kinds = set()
     for folder in runs:
         config = OmegaConf.load(folder / "config.yaml")
         kinds.add((config.model.name, config.seq_len, config.model.metric))
         differs = f"model-{config.model.name}_seq_len-{config.seq_len}_metric-"
-        assert folder.name == differs + str(config.model.metric)
-    assert len(kinds) == 12
+        assert folder.name == differs + str(config.model.metric).lower()
+    assert len(kinds) == 8
     assert FIGURES  # each run folder's contract has a test of its own
 
 

@@ -87,8 +87,7 @@ def test_metrics_hold_the_validation_of_the_best_checkpoint_and_the_time_of_all_
     figures, curve = saved[BEST]["validation"]
     assert figures.items() <= metrics.items()
     assert curve[0] == pytest.approx(figures["val/exact_match"])
-    clocks = [checkpoint["callbacks"]["Speed"]["seconds"] for checkpoint in saved.values()]
-    assert metrics["seconds/train"] > max(clocks)
+    assert metrics["seconds/train"] > saved[LAST]["callbacks"]["Speed"]["seconds"]
 
 
 def test_what_is_logged_can_be_seen_in_tensorboard(whole_run):
@@ -337,20 +336,6 @@ def test_a_run_folder_that_was_moved_keeps_its_best_checkpoint(whole_run, tmp_pa
     here = str(tmp_path / BEST)
     assert moved.best_model_path == moved.kth_best_model_path == here
     assert moved.best_k_models == {here: state["best_model_score"]}
-
-
-def test_two_processes_measure_what_one_does(toy_overrides, tmp_path):
-    """Three meshes on two processes: every mesh counts once."""
-    shared = subprocess.run(
-        [sys.executable, "-m", "src.train", *toy_overrides, "trainer=ddp", "optim.epochs=2",
-         "trainer.accelerator=cpu", "trainer.devices=2", f"hydra.run.dir={tmp_path}"],
-        cwd=ROOT, capture_output=True, text=True, check=False,
-    )  # fmt: skip
-    assert shared.returncode == 0, shared.stdout + shared.stderr
-    together = json.loads((tmp_path / METRICS).read_text())
-    alone = run(tmp_path, [*toy_overrides, "optim.epochs=2"])
-    for name in sorted(FIGURES - {"seconds/preprocess", "seconds/train"}):
-        assert together[name] == pytest.approx(alone[name], rel=1e-5), name
 
 
 def test_resume_takes_the_runs_config_and_only_harmless_changes(tmp_path, toy_overrides):
