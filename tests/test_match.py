@@ -18,7 +18,7 @@ import trimesh
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from src import matches
+from src import exports
 from src.data.scans import open_scan, scan
 from src.geometry.mesh import Mesh, MeshError
 from src.match import main, named
@@ -322,10 +322,10 @@ def test_a_full_disk_ends_the_command(cli, trained, files, monkeypatch):  # noqa
             raise OSError(errno.ENOSPC, "No space left on device", str(path))
         write_whole(path, content)
 
-    monkeypatch.setattr(matches, "write_whole", write)
+    monkeypatch.setattr(exports, "write_whole", write)
     code, out, err = cli(*common, program=main)
     assert code == 1 and "No space left on device" in out and "Traceback" not in out + err
-    monkeypatch.setattr(matches, "write_whole", write_whole)
+    monkeypatch.setattr(exports, "write_whole", write_whole)
     code, out, _ = cli(*common, program=main)
     assert code == 0 and "1 of 3 are done already" in out and "2 meshes matched" in out
 
