@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from omegaconf import DictConfig
+from tqdm import tqdm
 
 from src.cli import entry_point
 from src.config import ConfigError, typed
@@ -75,7 +76,12 @@ def pair(config: DictConfig) -> Path:
     folder = Path(config.output or Path("outputs", "matches", name))
     job = matches.Job.of(config, picture=config.picture is not False)
     began = time.perf_counter()
-    found = matches.one(job, config.source, folder)
+    with tqdm(total=2 if config.target else 1, desc="Matching", unit="mesh", leave=False,
+              delay=1.0) as progress:  # fmt: skip
+        if config.target:
+            job.target_labels()
+            progress.update()
+        found = matches.one(job, config.source, folder)
     if config.target:
         matches.write_target(job, folder)
     for line in matches.told(found):
@@ -93,7 +99,6 @@ def many(config: DictConfig) -> Path:
     are. Errors: DataError if a mesh could not be used, or a process was killed."""
     from joblib import Parallel, cpu_count, delayed
     from joblib.externals.loky.process_executor import TerminatedWorkerError
-    from tqdm import tqdm
 
     from src import matches
     from src.sweeps import legal_name
