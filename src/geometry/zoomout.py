@@ -11,6 +11,7 @@ from scipy.spatial import cKDTree
 from src.geometry.mesh import Mesh, MeshError
 
 FROM, TO, STEP = 20, 80, 5  # numbers of eigenfunctions
+ROUNDS = 100  # of ARPACK: a mesh needs a few, one far from a surface would take minutes
 
 
 def eigenfunctions(mesh: Mesh, count: int) -> tuple[np.ndarray, np.ndarray]:
@@ -30,7 +31,7 @@ def eigenfunctions(mesh: Mesh, count: int) -> tuple[np.ndarray, np.ndarray]:
     shift = -1e-8 * 4 * np.pi**2 / mesh.area  # just below 0, the least eigenvalue
     try:
         _, functions = eigsh(stiffness, k=count, M=diags_array(masses, format="csc"), sigma=shift,
-                             v0=np.ones(len(masses)))  # fmt: skip
+                             v0=np.ones(len(masses)), maxiter=ROUNDS)  # fmt: skip
     except (ArpackError, RuntimeError) as error:
         raise MeshError(f"{mesh.name}: its Laplacian has no eigenfunctions ({error})") from error
     return functions, masses
