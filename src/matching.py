@@ -89,7 +89,7 @@ class Matcher:
     def label(self, scan: Scan) -> Labels:
         """Errors: MeshError for a mesh that can't be described."""
         mesh = unit(scan.mesh)
-        if self._resamples(len(np.unique(mesh.faces))):
+        if self._resamples(len(mesh.vertices)):
             coarse = resample(mesh, self._resolution)
             template, confidence = self._predict(coarse.mesh)
             most = coarse.corners[np.arange(len(mesh.vertices)), coarse.weights.argmax(axis=1)]

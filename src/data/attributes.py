@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import io
 from pathlib import Path
 
 import numpy as np
 
 from src.data.shapes import DataError
-from src.geometry.mesh import read_arrays, without_texture
+from src.geometry.mesh import load_parts, read_arrays
 
 KINDS = ("color", "uv")
 
@@ -49,19 +48,9 @@ def _array(path: Path) -> np.ndarray:
 
 
 def _of_parts(path: Path, what: str) -> np.ndarray | None:
-    import trimesh
-
     read_arrays(path)  # says what is wrong with the file
-    data = path.read_bytes()
-    if path.suffix.lower() == ".ply":
-        data = without_texture(data)
-    loaded = trimesh.load(io.BytesIO(data), file_type=path.suffix.lower()[1:], process=False,
-                          maintain_order=True)  # fmt: skip
-    parts = [loaded]
-    if hasattr(loaded, "geometry"):  # in the order of `read_arrays`
-        names = [loaded.graph[node][1] for node in sorted(loaded.graph.nodes_geometry)]
-        parts = [loaded.geometry[name] for name in names]
-    values = [_visual(part.visual, what) for part in parts if len(getattr(part, "faces", []))]
+    parts = load_parts(path.read_bytes(), path.suffix.lower())
+    values = [_visual(part.visual, what) for part, _ in parts]
     return None if any(value is None for value in values) else np.concatenate(values)
 
 

@@ -156,18 +156,12 @@ def read_arrays(path: str | Path) -> tuple[np.ndarray, np.ndarray]:
 
 def parse_arrays(data: bytes, suffix: str, name: str) -> tuple[np.ndarray, np.ndarray]:
     """`read_arrays` for the bytes of a file already in memory."""
-    import trimesh  # slow to import, and not needed by a run whose tensors are all on disk
-
     if not data:
         raise MeshError(f"{name}: the file is empty")
     try:
         if suffix == ".obj":
             data = _only_vertices_and_faces(data)
-        if suffix == ".ply":
-            data = without_texture(data)
-        loaded = trimesh.load(io.BytesIO(data), file_type=suffix[1:], process=False,
-                              maintain_order=True)  # fmt: skip
-        parts = _parts(loaded)
+        parts = [_placed(mesh, matrix) for mesh, matrix in load_parts(data, suffix)]
     except Exception as error:  # whatever a parser raises on a damaged file
         reason = (str(error).splitlines() or [type(error).__name__])[0][:200]
         raise MeshError(f"{name}: not a readable {suffix[1:].upper()} file ({reason})") from error
@@ -185,25 +179,32 @@ def parse_arrays(data: bytes, suffix: str, name: str) -> tuple[np.ndarray, np.nd
     return vertices, faces
 
 
-def _parts(loaded) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Vertices and faces of each triangle mesh in what trimesh has read, in its place."""
+def load_parts(data: bytes, suffix: str) -> list[tuple]:
+    """What trimesh reads of a file: each triangle mesh, and the matrix that puts it in its place,
+    or None. Errors: any."""
+    import trimesh  # slow to import, and not needed by a run whose tensors are all on disk
+
+    if suffix == ".ply":
+        data = _without_texture(data)
+    loaded = trimesh.load(io.BytesIO(data), file_type=suffix[1:], process=False,
+                          maintain_order=True)  # fmt: skip
     if not hasattr(loaded, "geometry"):
         found = [(loaded, None)]
     else:
         places = [loaded.graph[node] for node in sorted(loaded.graph.nodes_geometry)]
         found = [(loaded.geometry[name], matrix) for matrix, name in places]
-    parts = []
-    for mesh, matrix in found:
-        faces = np.asarray(getattr(mesh, "faces", []))
-        if len(faces):
-            vertices = np.asarray(mesh.vertices, dtype=np.float64)
-            if matrix is not None and not np.array_equal(matrix, np.eye(4)):
-                vertices = vertices @ matrix[:3, :3].T + matrix[:3, 3]
-            parts.append((vertices, faces))
-    return parts
+    return [(mesh, matrix) for mesh, matrix in found if len(getattr(mesh, "faces", []))]
 
 
-def without_texture(ply: bytes) -> bytes:
+def _placed(mesh, matrix) -> tuple[np.ndarray, np.ndarray]:
+    """Vertices and faces of a part, in its place."""
+    vertices = np.asarray(mesh.vertices, dtype=np.float64)
+    if matrix is not None and not np.array_equal(matrix, np.eye(4)):
+        vertices = vertices @ matrix[:3, :3].T + matrix[:3, 3]
+    return vertices, np.asarray(mesh.faces)
+
+
+def _without_texture(ply: bytes) -> bytes:
     """A PLY whose faces' texture coordinates have another name: trimesh would give each corner of a
     face a vertex of its own for them."""
     end = ply.find(b"end_header")
