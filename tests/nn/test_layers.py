@@ -190,6 +190,14 @@ def test_an_lstm_over_few_sequences_at_a_time_is_the_same(rows, monkeypatch):
         torch.testing.assert_close(layer(features, spirals, extra), whole[0], rtol=0, atol=1e-12)
 
 
+def test_an_lstm_s_gradient_is_formed_once():
+    layer = SpiralLSTM(3, 4)
+    out = layer(torch.randn(9, 3), sequences(9, 5, padded=False)).sum()
+    out.backward(retain_graph=True)
+    with pytest.raises(RuntimeError, match="can be formed once"):
+        out.backward()
+
+
 def test_an_lstm_under_autocast_multiplies_in_bf16_and_remembers_in_float32():
     layer = SpiralLSTM(8, 16)
     features, spirals = torch.randn(40, 8, requires_grad=True), sequences(40, 20, padded=True)
