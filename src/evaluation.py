@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, fields
 from pathlib import Path
@@ -13,7 +12,7 @@ import numpy as np
 from src.data.datamodule import Batch
 from src.data.reference import ReferenceDistances
 from src.metrics import CorrespondenceError, geodesic_errors, point_errors
-from src.runs import RunError, write_whole
+from src.runs import RunError, write_arrays
 
 ERRORS = "errors.npz"
 
@@ -88,11 +87,7 @@ class Outcome:
         return figures, curve
 
     def save(self, path: Path) -> None:
-        whole = io.BytesIO()
-        np.savez_compressed(
-            whole, **{f.name: np.asarray(getattr(self, f.name)) for f in fields(self)}
-        )
-        write_whole(path, whole.getvalue())
+        write_arrays(path, **{f.name: np.asarray(getattr(self, f.name)) for f in fields(self)})
 
     @classmethod
     def load(cls, path: Path) -> Outcome:

@@ -13,13 +13,6 @@ from src.data.scans import Scan
 from src.runs import write_whole
 
 
-def write_arrays(path: Path, **arrays: np.ndarray) -> None:
-    """A .npz file."""
-    whole = io.BytesIO()
-    np.savez_compressed(whole, **arrays)
-    write_whole(path, whole.getvalue())
-
-
 def write_lines(path: Path, numbers: np.ndarray) -> None:
     """A text file with a whole number a line."""
     write_whole(path, "\n".join(map(str, numbers.tolist())) + "\n")

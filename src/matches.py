@@ -16,7 +16,7 @@ from src.data.attributes import KINDS, read_attribute
 from src.data.scans import Scan, open_scan
 from src.data.shapes import DataError
 from src.data.store import digest
-from src.exports import write_arrays, write_carried, write_colored, write_lines
+from src.exports import write_carried, write_colored, write_lines
 from src.figures import (
     confidence_colors,
     encoded,
@@ -27,7 +27,7 @@ from src.figures import (
 from src.geometry.mesh import Mesh, MeshError
 from src.matching import SHIPPED, Labels, Matcher, nearest
 from src.render import RenderError, Row, render
-from src.runs import BEST, write_whole
+from src.runs import BEST, write_arrays, write_whole
 
 FILE = "match.npz"
 TARGET = ("target.npz", "target.ply")

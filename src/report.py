@@ -65,7 +65,8 @@ def report(config: DictConfig) -> Path:
         figure = curve_figure({name: (THRESHOLDS, several) for name, several in curves.items()})
         svg = encoded(figure, "svg").decode()
         drawn[title] = svg[svg.index("<svg") :]
-        write_whole(folder / f"{file_name(title)}.pdf", encoded(figure, "pdf"))
+        for kind in ("pdf", "png"):
+            write_whole(folder / f"{file_name(title)}.{kind}", encoded(figure, kind))
     write_whole(folder / "table.csv", as_csv(*run_table(groups)))
     write_whole(folder / "table.tex", as_tex(groups))
     scenes, notes = looks(runs, config.shapes)

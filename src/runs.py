@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import io
 import json
 import os
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
@@ -35,6 +37,13 @@ def write_whole(path: Path, content: str | bytes) -> None:
     temporary = path.with_name(path.name + ".tmp")
     temporary.write_bytes(content if isinstance(content, bytes) else content.encode())
     os.replace(temporary, path)
+
+
+def write_arrays(path: Path, **arrays: np.ndarray) -> None:
+    """A .npz file that appears whole or not at all."""
+    whole = io.BytesIO()
+    np.savez_compressed(whole, **arrays)
+    write_whole(path, whole.getvalue())
 
 
 def claim(folder: Path, config: DictConfig) -> None:

@@ -20,6 +20,7 @@ from src.report import beside, file_name, main
 from src.runs import CONFIG, METRICS
 from src.tables import run_table
 from tests.conftest import toy_shapes
+from tests.data.test_remeshed import REMESH
 from tests.test_cli import QUICK, cli  # noqa: F401
 from tests.test_train import run
 
@@ -110,6 +111,7 @@ def test_the_report_is_one_page_with_tables_and_figures(cli, sweep, tmp_path):  
         assert float(row["exact match (%)"]) == pytest.approx(100 * metrics["test/exact_match"])
         assert int(float(row["parameters"])) == metrics["parameters"]
     assert len(list(folder.glob("*.pdf"))) == text.count("<figcaption>") == 9
+    assert len(list(folder.glob("*.png"))) == 9
     tex = (folder / "table.tex").read_text()
     body = [line for line in tex.splitlines() if line.endswith(r"\\")]
     assert len(body) == 7 and len({line.count("&") for line in body}) == 1
@@ -136,6 +138,20 @@ def test_the_shapes_of_the_page_are_those_of_the_data_set(cli, sweep, tmp_path):
     np.testing.assert_array_equal(faces, template.faces)
     labels = np.frombuffer(base64.b64decode(scene["labels"]), "<i4")
     assert labels.tolist() == list(range(162))
+
+
+def test_remeshed_shapes_are_surfaces_of_their_own(cli, toy_overrides, tmp_path):  # noqa: F811
+    run(tmp_path / "run", [*toy_overrides, *REMESH, "optim.epochs=1"])
+    code, out, err = cli("runs=run", "shapes=2", program=main)
+    assert code == 0 and "no view" not in out, err
+    [row] = csv.reader((tmp_path / "run/report/table.csv").read_text().splitlines()[1:])
+    assert row[0] == "FCS-NET"
+    data = json.loads(Page((tmp_path / "run/report/index.html").read_text()).data)
+    sizes = {scene["name"]: len(base64.b64decode(scene["labels"])) // 4 for scene in data["scenes"]}
+    assert len(sizes) == 2 and 162 not in sizes.values()
+    for scene in data["scenes"]:
+        points = base64.b64decode(data["surfaces"][scene["shape"]]["points"])
+        assert len(points) == 3 * 4 * sizes[scene["name"]]
 
 
 def test_broken_runs_are_named_and_the_others_shown(cli, sweep, tmp_path):  # noqa: F811

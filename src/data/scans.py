@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 import trimesh
 
-from src.geometry.mesh import Mesh, MeshError, read_arrays
+from src.geometry.mesh import Mesh, MeshError, in_use, read_arrays
 from src.geometry.repair import outwards
 from src.geometry.repair import repair as mend
 
@@ -60,11 +60,11 @@ def scan(vertices: np.ndarray, faces: np.ndarray, name: str, repair: bool = Fals
     if not LEAST < size < MOST or not 0 < mesh.area < np.inf:
         raise MeshError(f"{name}: {size:.3g} across, which is no surface to describe; it needs an "
                         f"area, and a size of {LEAST:g} to {MOST:g}")  # fmt: skip
-    used, faces_ = np.unique(mesh.faces, return_inverse=True)
+    used, numbered = in_use(mesh.faces)
     number = np.full(len(mesh.vertices) + 1, -1)
     number[used] = np.arange(len(used))
     place, origin = number[place], origin[used]
-    mesh, turned = outwards(Mesh(mesh.vertices[used], faces_.reshape(-1, 3), name))
+    mesh, turned = outwards(Mesh(mesh.vertices[used], numbered, name))
     if turned:
         remarks.append(f"{turned:,} pieces of the surface were inside out and have been turned")
     if lost := int((place < 0).sum()):

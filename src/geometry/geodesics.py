@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import potpourri3d
 
-from src.geometry.mesh import Mesh, MeshError
+from src.geometry.mesh import Mesh, MeshError, in_use
 
 
 class GeodesicSolver:
@@ -19,13 +19,13 @@ class GeodesicSolver:
     def __init__(self, mesh: Mesh):
         if mesh.area == 0:
             raise MeshError(f"{mesh.name}: no surface area, so no distances on it")
-        self._used, faces = np.unique(mesh.faces, return_inverse=True)
+        self._used, faces = in_use(mesh.faces)
         self._place = np.full(len(mesh.vertices), -1)
         self._place[self._used] = np.arange(len(self._used))
         self._component = _components(mesh)
         try:
             self._solver = potpourri3d.MeshHeatMethodDistanceSolver(
-                mesh.vertices[self._used], faces.reshape(-1, 3)
+                mesh.vertices[self._used], faces
             )
         except RuntimeError as error:
             raise MeshError(f"{mesh.name}: its faces are so thin that there are no geodesic "

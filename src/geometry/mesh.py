@@ -103,6 +103,12 @@ class Mesh:
         return Mesh(self.vertices[order], inverse[self.faces], self.name)
 
 
+def in_use(faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The vertices that faces [F, 3] name, int [U], ascending; and the faces numbered by these."""
+    used, numbered = np.unique(faces, return_inverse=True)
+    return used, numbered.reshape(-1, 3)
+
+
 def _refuse(name, bad, rows, what, rule, number=True, shown=3):
     """Raise MeshError with the count and the first offenders, if any of `bad` [K] is set."""
     where = np.flatnonzero(bad)

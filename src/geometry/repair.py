@@ -9,7 +9,7 @@ import trimesh
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from src.geometry.mesh import Mesh, MeshError
+from src.geometry.mesh import Mesh, MeshError, in_use
 from src.geometry.resample import without_repeats
 
 CLEARLY = 0.05
@@ -85,10 +85,10 @@ def repair(vertices: np.ndarray, faces: np.ndarray, name: str) -> Repaired:
     note(cuts, "edges cut open where the faces can't agree")
     origin = origin[again]
 
-    used, faces = np.unique(faces, return_inverse=True)
+    used, faces = in_use(faces)
     became = np.full(len(place) + 1, -1)
     became[origin[used][::-1]] = np.arange(len(used))[::-1]  # of the copies of a vertex the first
-    mesh = Mesh(vertices[used], faces.reshape(-1, 3), name)
+    mesh = Mesh(vertices[used], faces, name)
     return Repaired(mesh, became[place], origin[used], changes)
 
 

@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 import trimesh
 
-from src.geometry.mesh import Mesh, MeshError
+from src.geometry.mesh import Mesh, MeshError, in_use
 from src.geometry.remesh import closest_points
 
 POINTS = 20_000  # looked up at a time
@@ -36,8 +36,8 @@ def resample(mesh: Mesh, vertices: int) -> Resampled:
     """
     import pyvista  # takes a second
 
-    used = np.unique(mesh.faces)
-    points, faces = mesh.vertices[used], np.searchsorted(used, mesh.faces)
+    used, faces = in_use(mesh.faces)
+    points = mesh.vertices[used]
     while len(points) < vertices:
         points, faces = trimesh.remesh.subdivide(points, faces)
     surface = pyvista.make_tri_mesh(np.ascontiguousarray(points), faces)
@@ -48,10 +48,10 @@ def resample(mesh: Mesh, vertices: int) -> Resampled:
     faces = without_repeats(faces)
     while len(faces) and len(extra := surplus(faces, len(points))):
         faces = np.delete(faces, extra, axis=0)
-    used, faces = np.unique(faces, return_inverse=True)
+    used, faces = in_use(faces)
     if len(used) < 4:
         raise MeshError(f"{mesh.name}: nothing is left of it with {vertices} vertices")
-    coarse = Mesh(points[used], faces.reshape(-1, 3), mesh.name)
+    coarse = Mesh(points[used], faces, mesh.name)
     parts = [
         closest_points(coarse, mesh.vertices[start : start + POINTS],
                        mesh.vertex_normals[start : start + POINTS])[:2]
