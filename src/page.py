@@ -12,14 +12,14 @@ import numpy as np
 from jinja2 import Environment, FileSystemLoader
 from plotly.offline import get_plotlyjs
 
-from src.comparison import FIGURES, Group, other_settings, plain
+from src.comparison import FIGURES, Group, plain
 from src.data.datamodule import CorrespondenceData
 from src.data.store import digest
 from src.evaluation import Outcome
 from src.figures import ERROR_COLORS, MOST_ERROR, template_colors
 from src.geometry.mesh import Mesh
 from src.render import upright
-from src.tables import described, run_table, spread
+from src.tables import group_table, run_table, spread
 
 
 def page(
@@ -30,18 +30,14 @@ def page(
     environment = Environment(loader=FileSystemLoader(Path(__file__).parent), autoescape=True,
                               trim_blocks=True, lstrip_blocks=True)  # fmt: skip
     columns, rows = run_table(groups)
-    several = [group for group in groups if len(group.seeds) > 1]
-    others = other_settings(groups)
+    seed_columns, of_groups = group_table(groups)
     scale = (255 * ERROR_COLORS(np.linspace(0, 1, 256))[:, :3]).round().astype(int).tolist()
     data = json.dumps({"scenes": scenes.scenes, "surfaces": scenes.surfaces, "scale": scale})
     return environment.get_template("page.html").render(
         columns=columns,
         rows=[[cell(*pair) for pair in zip(columns, row, strict=True)] for row in rows],
-        seeds=[[*map(plain, described(group)), len(group.seeds),
-                *(plain(dict(group.others).get(key)) for key in others),
-                *(spread([run.figure(key) for run in group.runs], key) for key in FIGURES)]
-               for group in several],
-        seed_columns=["network", "N", "metric", "data", "seeds", *others, *FIGURES.values()],
+        seeds=[row for row, group in zip(of_groups, groups, strict=True) if len(group.seeds) > 1],
+        seed_columns=seed_columns,
         broken=broken, curves=curves, notes=notes, runs=len(rows), scenes=len(scenes.scenes),
         data=data.replace("<", "\\u003c"), plotly=get_plotlyjs() if scenes.scenes else "",
     )  # fmt: skip

@@ -50,7 +50,7 @@ def report(config: DictConfig) -> Path:
     from src.figures import curve_figure, encoded
     from src.metrics import THRESHOLDS
     from src.page import page
-    from src.tables import as_csv, as_tex, run_table
+    from src.tables import as_csv, as_markdown, as_tex, group_table, run_table
 
     runs, broken = collect(config.runs)
     for _, reason in broken:
@@ -68,7 +68,8 @@ def report(config: DictConfig) -> Path:
         for kind in ("pdf", "png"):
             write_whole(folder / f"{file_name(title)}.{kind}", encoded(figure, kind))
     write_whole(folder / "table.csv", as_csv(*run_table(groups)))
-    write_whole(folder / "table.tex", as_tex(groups))
+    write_whole(folder / "table.tex", as_tex(*group_table(groups)))
+    write_whole(folder / "table.md", as_markdown(*group_table(groups)))
     scenes, notes = looks(runs, config.shapes)
     for group in groups:
         if len(group.seeds) < len(group.runs):

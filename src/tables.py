@@ -35,23 +35,30 @@ def as_csv(columns: list[str], rows: list[list[Any]]) -> str:
     return text.getvalue()
 
 
-def as_tex(groups: list[Group]) -> str:
-    """A table for booktabs: a row for each group, mean and spread where it has several seeds."""
+def group_table(groups: list[Group]) -> tuple[list[str], list[list[str]]]:
+    """Names of columns, and a row of texts for each group: mean and spread where it has several
+    seeds."""
     others = other_settings(groups)
-    shown = [key for key in FIGURES if key.startswith("test/") or key == "parameters"]
-    columns = ["network", "$N$", "metric", "data", *map(escaped, others),
-               *(escaped(FIGURES[key]) for key in shown)]  # fmt: skip
-    lines = [rf"\begin{{tabular}}{{{'l' * (4 + len(others))}{'r' * len(shown)}}}", r"\toprule",
-             " & ".join(columns) + r" \\", r"\midrule"]  # fmt: skip
+    columns = ["network", "N", "metric", "data", "seeds", *others, *FIGURES.values()]
+    rows = []
     for group in groups:
-        cells = [*described(group), *(dict(group.others).get(key) for key in others)]
-        texts = ["--" if cell is None else escaped(plain(cell)) for cell in cells]
-        texts += [
-            spread([run.figure(key) for run in group.runs], key).replace("±", r"$\pm$")
-            for key in shown
-        ]
-        lines.append(" & ".join(texts) + r" \\")
-    return "\n".join([*lines, r"\bottomrule", r"\end{tabular}", ""])
+        cells = [*described(group), len(group.seeds), *(dict(group.others).get(k) for k in others)]
+        figures = [spread([run.figure(key) for run in group.runs], key) for key in FIGURES]
+        rows.append([*map(plain, cells), *figures])
+    return columns, rows
+
+
+def as_markdown(columns: list[str], rows: list[list[str]]) -> str:
+    lines = columns, ["---"] * len(columns), *rows
+    return "".join(f"| {' | '.join(cell.replace('|', '/') for cell in line)} |\n" for line in lines)
+
+
+def as_tex(columns: list[str], rows: list[list[str]]) -> str:
+    """A table for booktabs."""
+    sides = "".join("r" if column in FIGURES.values() else "l" for column in columns)
+    first, *others = (" & ".join(map(escaped, row)) + r" \\" for row in (columns, *rows))
+    return "\n".join([rf"\begin{{tabular}}{{{sides}}}", r"\toprule", first, r"\midrule", *others,
+                      r"\bottomrule", r"\end{tabular}", ""])  # fmt: skip
 
 
 def spread(values: list[float], key: str) -> str:
@@ -67,5 +74,6 @@ def spread(values: list[float], key: str) -> str:
 
 
 def escaped(text: str) -> str:
-    named = {"\\": r"\textbackslash ", "^": r"\textasciicircum ", "~": r"\textasciitilde "}
+    named = {"\\": r"\textbackslash ", "^": r"\textasciicircum ", "~": r"\textasciitilde ",
+             "±": r"$\pm$", "\u2013": "--"}  # fmt: skip
     return "".join(named.get(c, "\\" + c if c in "_%&#${}" else c) for c in text)

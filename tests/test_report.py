@@ -116,6 +116,10 @@ def test_the_report_is_one_page_with_tables_and_figures(cli, sweep, tmp_path):  
     body = [line for line in tex.splitlines() if line.endswith(r"\\")]
     assert len(body) == 7 and len({line.count("&") for line in body}) == 1
     assert r"$\pm$" in tex and "_" not in tex.replace(r"\_", "")
+    marked = (folder / "table.md").read_text().splitlines()
+    assert len(marked) == 2 + 6 and len({line.count("|") for line in marked}) == 1
+    [pair] = [line for line in marked if "±" in line]
+    assert pair.startswith("| FCS-NET | 5 | no | folder | 2 | 0.004 |")
 
 
 def test_the_shapes_of_the_page_are_those_of_the_data_set(cli, sweep, tmp_path):  # noqa: F811
