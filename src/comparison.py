@@ -153,17 +153,19 @@ def grouped(runs: list[Run]) -> list[Group]:
 
 
 def data_names(runs: list[Run]) -> list[str]:
-    """For each run the name of its data set, with the settings in which sets of that name differ,
-    and a number where their test shapes differ all the same, as those of two folders do."""
+    """For each run the name of its data set, with the policy it was remeshed by, the settings in
+    which sets of that name differ, and a number where their test shapes differ all the same, as
+    those of two folders do."""
     ways = [{k.removeprefix("data."): v for k, v in run.settings.items() if k.startswith("data.")}
             for run in runs]  # fmt: skip
     names: list[str] = []
     for way in ways:
-        alike = [other for other in ways if other["name"] == way["name"]]
+        kind = way["name"], way.get("remesh.policy")
+        alike = [w for w in ways if (w["name"], w.get("remesh.policy")) == kind]
         differ = [k for k, v in way.items() if any(other.get(k) != v for other in alike)]
         said = [v if isinstance(v, str | int) else digest(json.dumps(v))[:6]
                 for v in (way[k] for k in differ if not k.startswith(SHARED))]  # fmt: skip
-        names.append(" ".join([way["name"], *map(str, said)]))
+        names.append(" ".join([*filter(None, kind), *map(str, said)]))
     kinds: dict[str, list[str]] = {}
     for i, run in enumerate(runs):
         kept = run.outcome

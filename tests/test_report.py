@@ -149,7 +149,7 @@ def test_remeshed_shapes_are_surfaces_of_their_own(cli, toy_overrides, tmp_path)
     code, out, err = cli("runs=run", "shapes=2", program=main)
     assert code == 0 and "no view" not in out, err
     [row] = csv.reader((tmp_path / "run/report/table.csv").read_text().splitlines()[1:])
-    assert row[0] == "FCS-NET"
+    assert row[0] == "FCS-NET" and row[3] == "folder mixed"
     data = json.loads(Page((tmp_path / "run/report/index.html").read_text()).data)
     sizes = {scene["name"]: len(base64.b64decode(scene["labels"])) // 4 for scene in data["scenes"]}
     assert len(sizes) == 2 and 162 not in sizes.values()
