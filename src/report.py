@@ -68,8 +68,9 @@ def report(config: DictConfig) -> Path:
         for kind in ("pdf", "png"):
             write_whole(folder / f"{file_name(title)}.{kind}", encoded(figure, kind))
     write_whole(folder / "table.csv", as_csv(*run_table(groups)))
-    write_whole(folder / "table.tex", as_tex(*group_table(groups)))
-    write_whole(folder / "table.md", as_markdown(*group_table(groups)))
+    of_groups = group_table(groups)
+    write_whole(folder / "table.tex", as_tex(*of_groups))
+    write_whole(folder / "table.md", as_markdown(*of_groups))
     scenes, notes = looks(runs, config.shapes)
     for group in groups:
         if len(group.seeds) < len(group.runs):

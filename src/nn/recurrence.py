@@ -131,7 +131,7 @@ def _walk(
 
 def _walk_back(
     walked: _Walk, grad: Tensor, recurrent: Tensor, d_projected: Tensor, d_weight: Tensor,
-    d_metric: Tensor | None = None,
+    d_metric: Tensor | None,
 ) -> None:  # fmt: skip
     """Adds to the gradients what one by `out`, [R, H], makes of them, but for the cell gate's
     scale. The gates are lost."""
