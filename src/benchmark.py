@@ -119,7 +119,7 @@ def lines(part: str, rows: list[Row]):
 
 
 def show(value: object) -> str:
-    if isinstance(value, list):
+    if isinstance(value, (list, tuple)):
         return " ".join(map(show, value))
     return f"{value:,.{0 if value >= 100 else 3}f}" if isinstance(value, float) else str(value)
 

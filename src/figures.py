@@ -74,7 +74,7 @@ def growth_figure(series: list[dict]) -> Figure:
     series: as `src.growth.growth` gives them. Dashed: what is proportional to the size.
     """
     overs, units = list(dict.fromkeys(row["over"] for row in series)), ("seconds", "MB")
-    figure = Figure(figsize=(3.4 * len(overs), 5.6), layout="constrained")
+    figure = Figure(figsize=(3.4 * len(overs), 6.2), layout="constrained")
     axes = figure.subplots(2, len(overs), squeeze=False)
     for column, over in enumerate(overs):
         for unit, ax in zip(units, axes[:, column], strict=True):
@@ -91,7 +91,8 @@ def growth_figure(series: list[dict]) -> Figure:
             ax.set_xticks(sizes, names, fontsize="small")
             ax.set(xlabel=over, ylabel=unit)
             ax.grid(alpha=0.3)
-            ax.legend(fontsize="small", title="exponent", title_fontsize="small")
+            ax.legend(fontsize="small", title="exponent", title_fontsize="small", ncols=2,
+                      loc="lower center", bbox_to_anchor=(0.5, 1))  # fmt: skip
     return figure
 
 
