@@ -7,6 +7,8 @@ from numba import njit
 
 from src.geometry.mesh import Mesh
 
+OPEN, CLOSED = 1, 2  # kinds of fans
+
 
 def one_rings(mesh: Mesh) -> tuple[np.ndarray, np.ndarray]:
     """The neighbours of every vertex, clockwise as seen from outside (against the faces' winding).
@@ -20,17 +22,30 @@ def one_rings(mesh: Mesh) -> tuple[np.ndarray, np.ndarray]:
     clockwise: a closed fan from the neighbour nearest to the vertex, the fans in the order of the
     distance of their first neighbour. Nothing depends on the numbering of vertices or faces.
     """
-    return _one_rings(mesh.faces, mesh.vertices)
+    neighbours, first, begins = _one_rings(mesh.faces, len(mesh.vertices))
+    fans = np.diff(np.concatenate([[0], np.cumsum(begins > 0)])[first])
+    for v in np.flatnonzero(fans > 1):
+        here = slice(first[v], first[v + 1])
+        ring, begin = neighbours[here], begins[here]
+        distance = ((mesh.vertices[ring] - mesh.vertices[v]) ** 2).sum(axis=1)
+        parts = np.split(np.arange(len(ring)), np.flatnonzero(begin)[1:])
+        parts = [np.roll(part, -distance[part].argmin()) if begin[part[0]] == CLOSED else part
+                 for part in parts]  # fmt: skip
+        parts.sort(key=lambda part: distance[part[0]])
+        neighbours[here] = ring[np.concatenate(parts)]
+    return neighbours, first
 
 
 @njit(cache=True)
-def _one_rings(faces, vertices):
-    count = len(vertices)
+def _one_rings(faces, count):
+    """Neighbours and first as `one_rings` gives them, but for the order of several fans; and
+    begins int8 [E]: OPEN or CLOSED where a fan of this kind begins, else 0."""
     corner_first = np.zeros(count + 1, np.int64)
     for face in faces:
         for v in face:
             corner_first[v + 1] += 1
-    corner_first = np.cumsum(corner_first)
+    for v in range(count):
+        corner_first[v + 1] += corner_first[v]
     fill = corner_first[:-1].copy()
     source = np.empty(faces.size, np.int32)  # at a corner, clockwise leads from source ...
     target = np.empty(faces.size, np.int32)  # ... to target, across the corner's face
@@ -41,6 +56,7 @@ def _one_rings(faces, vertices):
             fill[a] += 1
 
     neighbours = np.empty(2 * faces.size, np.int32)
+    begins = np.zeros(2 * faces.size, np.int8)
     first = np.zeros(count + 1, np.int64)
     after = np.empty(count, np.int32)
     has_after = np.full(count, -1, np.int32)  # the last vertex for which after[x] was set
@@ -54,46 +70,17 @@ def _one_rings(faces, vertices):
             after[source[k]] = target[k]
             has_after[source[k]] = v
             has_before[target[k]] = v
-        fans = 0
-        for begins_open in (True, False):  # open fans first: what they leave is closed
+        for kind in (OPEN, CLOSED):  # open fans first: what they leave is closed
             for k in corners:
                 x = source[k]
-                if listed[x] == v or (begins_open and has_before[x] == v):
+                if listed[x] == v or (kind == OPEN and has_before[x] == v):
                     continue
-                fans += 1
+                begins[end] = kind
                 while listed[x] != v:
                     listed[x] = v
                     neighbours[end] = x
                     end += 1
                     if has_after[x] == v:
                         x = after[x]
-        if fans > 1:
-            _order_fans(neighbours[first[v] : end], v, vertices, has_after, has_before, after)
     first[count] = end
-    return neighbours[:end].copy(), first
-
-
-@njit(cache=True)
-def _order_fans(ring, v, vertices, has_after, has_before, after):
-    """Sort in place a ring that holds several fans, each contiguous, as `one_rings` says."""
-    distance = np.empty(len(ring))
-    for i, x in enumerate(ring):
-        distance[i] = np.sum((vertices[x] - vertices[v]) ** 2)
-    starts, stops, entries = [0], [0], [0]
-    starts.clear(), stops.clear(), entries.clear()
-    i = 0
-    while i < len(ring):
-        j = i + 1
-        while j < len(ring) and has_after[ring[j - 1]] == v and after[ring[j - 1]] == ring[j]:
-            j += 1
-        closed = has_before[ring[i]] == v
-        starts.append(i), stops.append(j)
-        entries.append(i + np.argmin(distance[i:j]) if closed else i)
-        i = j
-    old = ring.copy()
-    end = 0
-    for fan in np.argsort(np.array([distance[e] for e in entries])):
-        start, length = starts[fan], stops[fan] - starts[fan]
-        for k in range(length):
-            ring[end] = old[start + (entries[fan] - start + k) % length]
-            end += 1
+    return neighbours[:end].copy(), first, begins[:end]
