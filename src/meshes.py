@@ -61,9 +61,10 @@ def main(config: DictConfig) -> None:
 HELP = """\
 parts: connected components. closed: no boundary, every edge between two faces. edges cv: spread of
 the edges' lengths over their mean. least angle: of a face, in degrees, the median. shared: edges
-that join the same two vertices of the template as one of the mesh in the line above. off source:
-the farthest that this mesh and the one it was made from are apart, either way, over the mean edge.
-off label: the mean distance from the true point to its label, over the mean edge.
+that join the same two vertices of the template as one of the mesh in the line above, in the first
+line as one of the last mesh. off source: the farthest that this mesh and the one it was made from
+are apart, either way, over the mean edge. off label: the mean distance from the true point to its
+label, over the mean edge.
 """
 
 
