@@ -136,7 +136,7 @@ def _load(folder: Path) -> DictConfig:
     if not folder.is_dir():
         raise RunError(f"resume={folder}: is not a folder")
     if not (folder / CONFIG).is_file():
-        raise RunError(f"resume={folder}: holds no {CONFIG}: it is no run")
+        raise RunError(f"{folder} holds no {CONFIG}: it is no run")
     try:
         stored = OmegaConf.load(folder / CONFIG)
     except Exception as error:  # whatever YAML says of a damaged file

@@ -47,6 +47,13 @@ def test_a_killed_sweep_does_what_is_left(cli, toy_overrides, tmp_path):  # noqa
         "finished before: " in out
         and f"python -m src.report runs={sweep.relative_to(tmp_path)}" in out
     )
+
+    more = [word.replace("0,1,2", "0,1,2,3") for word in command]
+    code, out, err = cli(*more, f"hydra.sweep.dir={sweep}")
+    assert code == 0, err
+    assert [job for job, *_ in states(sweep)] == ["seed-0", "seed-1", "seed-2", "seed-3"]
+    assert (sweep / "seed-0" / METRICS).stat().st_mtime_ns == first
+
     whole = tmp_path / "whole"
     run(whole, [*toy, "optim.epochs=12", "seed=1"])
     kept, expected = weights(sweep / "seed-1"), weights(whole)
@@ -65,16 +72,15 @@ def test_what_failed_is_in_the_table_and_tried_again(cli, toy_overrides, monkeyp
             raise RuntimeError("out of ink")
         return real(mesh, radius, bins)
 
-    monkeypatch.setattr(preprocessing, "_descriptors", fails)
-    code, out, _ = cli(*command)
+    with monkeypatch.context() as broken:
+        broken.setattr(preprocessing, "_descriptors", fails)
+        code, out, _ = cli(*command)
     assert code == 1
     [sweep] = Path("outputs/sweeps").iterdir()
     assert [row[:2] for row in states(sweep)] == [
         ("data.shot.bins-4", "finished"), ("data.shot.bins-5", "failed")]  # fmt: skip
     assert "failed    RuntimeError('out of ink')" in out
     assert "Traceback" in (sweep / "data.shot.bins-5" / "train.log").read_text()
-    monkeypatch.undo()
-    monkeypatch.chdir(sweep.resolve().parents[2])
     code, out, err = cli(*command)
     assert code == 0, err
     assert not (sweep / "data.shot.bins-5" / FAILED).exists()
