@@ -31,7 +31,7 @@ class WholeFiles(TorchCheckpointIO):
     def save_checkpoint(self, checkpoint: dict[str, Any], path: Any, storage_options=None) -> None:
         path = Path(path)
         path.parent.mkdir(parents=True, exist_ok=True)
-        temporary = path.with_name(f"{path.name}.tmp")
+        temporary = path.with_name(f"{path.name}.{os.getpid()}.tmp")
         try:
             whole = io.BytesIO()  # torch.save to a full disk would not say that it is full
             torch.save(checkpoint, whole)
@@ -230,6 +230,7 @@ class OrderlyStop(Callback):
     def on_train_batch_start(self, trainer, module, batch, batch_idx) -> None:
         # Between two steps, and not before the last of an epoch: there Lightning can't tell a
         # finished epoch from an unfinished one. The start of an epoch is in last.ckpt already.
+        self._hear(trainer)
         if self.signum is None or 0 < batch_idx == trainer.num_training_batches - 1:
             return
         last = self.folder / LAST
@@ -237,7 +238,15 @@ class OrderlyStop(Callback):
             trainer.save_checkpoint(last)
         raise Stopped(self.signum)
 
+    def _hear(self, trainer: L.Trainer) -> None:
+        """Of several processes, a signal may have come to one alone: all stop at the same step."""
+        if trainer.world_size > 1 and trainer.strategy.reduce_boolean_decision(
+            self.signum is not None, all=False
+        ):
+            self.signum = self.signum or signal.SIGTERM
+
     def on_train_end(self, trainer: L.Trainer, module: L.LightningModule) -> None:
+        self._hear(trainer)
         self._restore()
         if self.signum is not None:
             raise Stopped(self.signum)

@@ -169,7 +169,9 @@ def data_names(runs: list[Run]) -> list[str]:
     kinds: dict[str, list[str]] = {}
     for i, run in enumerate(runs):
         kept = run.outcome
-        truth = digest(np.array(kept.names), kept.labels, kept.diameter)
+        shuffled = run.config["data"]["shuffle_vertices"]  # by each seed in another order
+        labels = np.sort(kept.labels) if shuffled else kept.labels
+        truth = digest(np.array(kept.names), labels, kept.diameter)
         known = kinds.setdefault(names[i], [])
         if truth not in known:
             known.append(truth)

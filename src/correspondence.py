@@ -127,6 +127,7 @@ class Correspondence(L.LightningModule):
                                   "faces": torch.from_numpy(template.faces)}  # fmt: skip
         checkpoint["up"] = data.shapes.up
         checkpoint["resolution"] = data.resolution
+        checkpoint["processes"] = self.trainer.world_size
         if "val" in self.curves:
             checkpoint["validation"] = (self.figures["val"], torch.from_numpy(self.curves["val"]))
 

@@ -166,7 +166,7 @@ def sketch_figure(points: np.ndarray, faces: np.ndarray, colors: np.ndarray) -> 
     seen = seen[np.argsort(corners[seen, :, 2].mean(axis=1))]
     shade = 0.35 + 0.65 * facing[seen, None]
     size = np.ptp(points, axis=0)
-    figure = Figure(figsize=(max(1.0, 5 * size[0] / size[1]), 5))
+    figure = Figure(figsize=(5 * min(max(0.2, size[0] / max(size[1], 1e-300)), 5), 5))
     axes = figure.add_axes((0, 0, 1, 1))
     paint = shade * colors[faces[seen]].mean(axis=1)
     axes.add_collection(PolyCollection(corners[seen, :, :2], facecolors=paint, edgecolors=paint,

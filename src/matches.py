@@ -84,6 +84,11 @@ class Job:
         """What is to be carried over, of the target's vertices."""
         return _carried(self) if self.transfer else None
 
+    def inputs(self) -> list[str]:
+        """The files it reads beside the sources."""
+        files = [self.target, None if self.transfer in KINDS else self.transfer]
+        return [file for file in files if file]
+
     def key(self, path: str) -> str:
         """The same as long as mesh, target, network and settings are."""
         return digest(_content(path), _common(self))
@@ -107,9 +112,7 @@ def _carried(job: Job) -> np.ndarray:
 
 @cache
 def _common(job: Job) -> str:
-    files = [str(Path(job.run) / BEST), *filter(None, [job.target])]
-    if job.transfer and job.transfer not in KINDS:
-        files.append(job.transfer)
+    files = [str(Path(job.run) / BEST), *job.inputs()]
     settings = job.repair, job.resample, job.smooth, job.transfer, job.picture
     return digest(*(_content(file) for file in files), *settings)
 
@@ -160,6 +163,7 @@ def one(job: Job, path: str, folder: Path) -> Matched:
     scan, carried, target = open_scan(path, job.repair), job.carried(), job.target_labels()
     source = Side(scan, job.matcher().label(scan))
     found = Matched(source, target, nearest(source.labels, target.labels) if target else None)
+    spare(folder, path, *job.inputs())
     _claim(folder, path)
     for old in OURS if target else OURS + TARGET:
         (folder / old).unlink(missing_ok=True)
@@ -182,6 +186,14 @@ def one(job: Job, path: str, folder: Path) -> Matched:
     return found
 
 
+def spare(folder: Path, *inputs: str) -> None:
+    """Errors: DataError if what is to be written to the folder would take an input's place."""
+    ours = {(folder / name).resolve() for name in OURS + TARGET}
+    for path in inputs:
+        if Path(path).resolve() in ours:
+            raise DataError(f"{path} would be overwritten; choose another folder with output=")
+
+
 def _claim(folder: Path, path: str) -> None:
     """Errors: DataError if the folder holds the match of another mesh."""
     folder.mkdir(parents=True, exist_ok=True)
@@ -196,6 +208,7 @@ def _claim(folder: Path, path: str) -> None:
 
 def write_target(job: Job, folder: Path) -> None:
     """target.npz and target.ply, which are the same for all sources."""
+    spare(folder, *job.inputs())
     scan, labels = job.target_labels()
     folder.mkdir(parents=True, exist_ok=True)
     write_arrays(folder / "target.npz", **labels._asdict())

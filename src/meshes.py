@@ -12,7 +12,7 @@ from tqdm import tqdm
 
 from src.cli import entry_point
 from src.config import ConfigError, checked_data, typed
-from src.data.shapes import SPLITS, Shape, ShapeSet
+from src.data.shapes import SPLITS, DataError, Shape, ShapeSet
 from src.geometry.mesh import Mesh
 
 log = logging.getLogger("src.meshes")
@@ -42,6 +42,8 @@ def main(config: DictConfig) -> None:
 
     shapes = open_shapes(OmegaConf.to_container(config.data))
     names = [n for split in SPLITS if config.split in (None, split) for n in shapes.names[split]]
+    if not names:
+        raise DataError(f"the data set has no mesh in its split {config.split}")
     shapes.prepare(names)
     log.info("%s", HELP)
     width = max(map(len, names))

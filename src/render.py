@@ -70,7 +70,7 @@ def _render_row(meshes, colors, up, views):
     import pyvista  # takes seconds
 
     sizes = [np.ptp(upright(mesh.vertices, up), axis=0) for mesh in meshes]
-    tall = max(size[1] for size in sizes)
+    tall = max(max(size[1], 0.05 * size[0]) for size in sizes)  # of a flat one, a line
     gap = 0.08 * tall
     middles, left = [], gap
     for size in sizes:

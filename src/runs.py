@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import contextlib
 import io
 import json
 import os
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from filelock import FileLock, Timeout
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
@@ -24,6 +27,10 @@ class RunError(ValueError):
     """A folder that is no run, or one that can't be continued as asked."""
 
 
+class InUse(RunError):
+    """Another process is training in the folder."""
+
+
 class Stopped(BaseException):
     """Ctrl-C or SIGTERM. The message says how to go on."""
 
@@ -34,7 +41,7 @@ class Stopped(BaseException):
 
 def write_whole(path: Path, content: str | bytes) -> None:
     """Write a file that appears whole or not at all."""
-    temporary = path.with_name(path.name + ".tmp")
+    temporary = path.with_name(f"{path.name}.{os.getpid()}.tmp")
     temporary.write_bytes(content if isinstance(content, bytes) else content.encode())
     os.replace(temporary, path)
 
@@ -61,6 +68,23 @@ def claim(folder: Path, config: DictConfig) -> None:
             )
         return
     write_whole(path, OmegaConf.to_yaml(config, resolve=True))
+
+
+@contextlib.contextmanager
+def alone(folder: Path) -> Iterator[None]:
+    """While this process trains there no other does; the system lets go of what a killed one held.
+    Errors: InUse."""
+    lock = FileLock(folder / ".lock", timeout=0)
+    try:
+        lock.acquire()
+    except Timeout as error:
+        raise InUse(f"another process is training in {folder}") from error
+    except NotImplementedError:  # a file system without locks
+        pass
+    try:
+        yield
+    finally:
+        lock.release()
 
 
 def differences(config: DictConfig, stored: DictConfig) -> list[str]:
@@ -90,15 +114,15 @@ def continued(config: DictConfig, overrides: list[str]) -> DictConfig:
         if key == "experiment":  # it may set anything
             contradicts = bool(differences(config, stored))
         else:
-            new, old = _plain(config, key), _plain(stored, key)
-            contradicts = new != old and not _may_change(key)
+            contradicts = any(f"{other}.".startswith(f"{key}.")
+                              for other in differences(config, stored))  # fmt: skip
         if contradicts:
             raise RunError(
                 f"{override} contradicts the run in {folder}; leave it out to go on with the run, "
                 f"or leave out resume= to start another. Free to change: {', '.join(MAY_CHANGE)}"
             )
         if _may_change(key):
-            OmegaConf.update(stored, key, new)
+            OmegaConf.update(stored, key, _plain(config, key))
     stored.resume = None
     return stored
 
@@ -125,11 +149,7 @@ def read_checkpoint(path: Path) -> dict[str, Any]:
 
 def stored_config(folder: Path) -> dict[str, Any]:
     """The whole config of a run, in plain containers. Errors: RunError if it is not one."""
-    try:
-        return OmegaConf.to_container(checked(_load(folder)))
-    except (ConfigError, OmegaConfBaseException, KeyError, TypeError) as error:
-        reason = str(error).splitlines()[0]
-        raise RunError(f"{folder / CONFIG} is no config of a run ({reason})") from error
+    return OmegaConf.to_container(_load(folder))
 
 
 def _load(folder: Path) -> DictConfig:
@@ -141,9 +161,11 @@ def _load(folder: Path) -> DictConfig:
         stored = OmegaConf.load(folder / CONFIG)
     except Exception as error:  # whatever YAML says of a damaged file
         raise RunError(f"{folder / CONFIG} can't be read: {str(error).splitlines()[0]}") from error
-    if not isinstance(stored, DictConfig):
-        raise RunError(f"{folder / CONFIG} is no config")
-    return stored
+    try:
+        return checked(stored)  # with what has been added to the settings since then
+    except (ConfigError, OmegaConfBaseException, AttributeError, KeyError, TypeError) as error:
+        reason = str(error).splitlines()[0]
+        raise RunError(f"{folder / CONFIG} is no config of a run ({reason})") from error
 
 
 def _may_change(key: str) -> bool:

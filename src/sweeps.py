@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
+import itertools
 import json
 import os
 import re
 import sys
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -25,12 +27,28 @@ COMMAND = "SPIRAL_COMMAND"  # in the environment: the words of the command line,
 def announce() -> None:
     """Have the jobs of this command line, in whatever process they run, know its words."""
     os.environ[COMMAND] = json.dumps(sys.argv[1:])
+    _fresh.cache_clear()
     Table.failed = 0
 
 
 def run_folder(resume: str | None, new: str) -> str:
-    """A run's folder: that of the run to go on with, if it is there."""
-    return resume if resume and Path(resume).is_dir() else new
+    """A run's folder: that of the run to go on with, if it is there; else a new one."""
+    return resume if resume and Path(resume).is_dir() else _fresh(new)
+
+
+@cache
+def _fresh(name: str) -> str:
+    """A folder of that name that nobody else has, made for this command line: runs that are started
+    at the same second get a number."""
+    for number in itertools.count(1):
+        folder = name if number == 1 else f"{name}_{number}"
+        try:
+            os.makedirs(folder)
+        except FileExistsError:
+            continue
+        except OSError:  # Hydra will say so
+            pass
+        return folder
 
 
 def sweep_folder() -> str:

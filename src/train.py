@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import shlex
 import subprocess
@@ -17,8 +18,10 @@ from src.runs import (
     BEST,
     LAST,
     METRICS,
+    InUse,
     RunError,
     Stopped,
+    alone,
     claim,
     continued,
     read_checkpoint,
@@ -50,7 +53,15 @@ def main(config: DictConfig) -> None:
         if in_sweep and config.trainer.strategy != "auto":
             train_apart(folder)
         else:
-            train(config, folder)
+            from lightning.pytorch.utilities import rank_zero_only
+
+            first = rank_zero_only.rank == 0  # of the processes of this run
+            with alone(folder) if first else contextlib.nullcontext():
+                train(config, folder)
+    except InUse:
+        if not in_sweep:
+            raise
+        log.info("another process is at it: %s", folder)
     except Stopped as stopped:
         resume = f"python -m src.train {shlex.quote(f'resume={folder}')}"
         how = "the same command" if in_sweep else resume
@@ -102,8 +113,8 @@ def train(config: DictConfig, folder: Path) -> dict[str, float]:
 
     last = folder / LAST
     for checkpoint in (last, folder / BEST):
-        if checkpoint.exists():
-            check(checkpoint, plain)
+        if last.exists() and checkpoint.exists():
+            check(checkpoint, plain, trainer.world_size)
     trainer.fit(module, datamodule=data, weights_only=True,
                 ckpt_path=last if last.exists() else None)  # fmt: skip
     [tested] = trainer.test(module, datamodule=data, ckpt_path=folder / BEST, weights_only=True,
@@ -132,15 +143,20 @@ def train(config: DictConfig, folder: Path) -> dict[str, float]:
     return metrics
 
 
-def check(checkpoint: Path, config: dict) -> None:
-    """Errors: RunError if a checkpoint can't be read, or is of another network."""
+def check(checkpoint: Path, config: dict, processes: int) -> None:
+    """Errors: RunError if a checkpoint can't be read, is of another network, or of a run in another
+    number of processes, whose epochs have another number of steps."""
     try:
-        theirs = read_checkpoint(checkpoint)["hyper_parameters"]["config"]
+        saved = read_checkpoint(checkpoint)
     except RunError as error:
-        raise RunError(f"{error}; without last.ckpt a run begins anew") from error
+        raise RunError(f"{error}; without its checkpoints the run begins anew") from error
+    theirs = OmegaConf.to_container(checked(OmegaConf.create(saved["hyper_parameters"]["config"])))
     for key in ("model", "seq_len"):
         if theirs[key] != config[key]:
             raise RunError(f"{checkpoint} is of another run: its {key} is {theirs[key]}")
+    if saved.get("processes", processes) != processes:
+        raise RunError(f"{checkpoint} is of a run in {saved['processes']} processes, this would be "
+                       f"{processes}: go on with the same trainer.devices")  # fmt: skip
 
 
 def describe(config: DictConfig, data, parameters: int, precision: str, seconds: float):

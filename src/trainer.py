@@ -28,21 +28,24 @@ def build_trainer(config: DictConfig, folder: Path, *callbacks: Callback) -> L.T
     quiet()
     torch.set_num_threads(config.trainer.threads or torch.get_num_threads())
     torch.set_flush_denormal(True)  # tiny probabilities would slow the softmax down tenfold
-    if config.trainer.accelerator == "cpu":
+    asked = config.trainer
+    # never Apple's GPUs, which have no float64
+    auto = "cuda" if torch.cuda.is_available() else "cpu"
+    accelerator = {"gpu": "cuda", "auto": auto}.get(asked.accelerator, asked.accelerator)
+    if accelerator == "cpu":
         keep_freed_memory()
     # `deterministic` below would also fill every new tensor with NaN; nothing here reads one unset
     torch.utils.deterministic.fill_uninitialized_memory = False
-    asked = config.trainer
     keep = {"dirpath": folder / "checkpoints", "enable_version_counter": False}
     try:
         return L.Trainer(
-            accelerator=asked.accelerator,
+            accelerator=accelerator,
             devices=asked.devices,
             strategy=asked.strategy,
-            precision=choose_precision(asked.precision, asked.accelerator),
+            precision=choose_precision(asked.precision, accelerator),
             max_epochs=config.optim.epochs,
             check_val_every_n_epoch=asked.val_every,
-            deterministic=asked.accelerator == "cpu",
+            deterministic=accelerator == "cpu",
             logger=TensorBoardLogger(folder, name="", version="", default_hp_metric=False),
             log_every_n_steps=10,
             num_sanity_val_steps=0,

@@ -17,11 +17,14 @@ from src.data.shapes import DataError, Shape, ShapeSet, SurfacePoints
 from src.data.store import Store
 from src.evaluate import main, merged
 from src.evaluation import ERRORS, Outcome, Result, evenly, result_of, rotations
-from src.figures import all_curves_figure, curve_figure, encoded, error_colors
+from src.figures import all_curves_figure, curve_figure, encoded, error_colors, sketch_figure
+from src.geometry.mesh import Mesh
 from src.metrics import THRESHOLDS, point_errors
 from src.predictor import template_of
+from src.render import Row, render
 from src.runs import BEST, METRICS, RunError
 from tests.conftest import toy_shapes
+from tests.meshes import lattice
 from tests.test_cli import cli  # noqa: F401
 from tests.test_train import composed, run
 
@@ -326,6 +329,16 @@ def test_curves_of_several_runs_have_a_band():
     figure = all_curves_figure(THRESHOLDS, curves)
     assert len(figure.axes[0].lines) == 2
     assert encoded(figure, "svg") == encoded(figure, "svg")
+
+
+@pytest.mark.parametrize("flat", [0, 1, 2])
+def test_a_flat_mesh_is_drawn(flat):
+    mesh = lattice(4, 4)
+    vertices = np.insert(mesh.vertices[:, :2], flat, 0.0, axis=1)
+    colors = np.ones((16, 3))
+    assert encoded(sketch_figure(vertices, mesh.faces, colors), "png")
+    [picture] = render([Row([Mesh(vertices, mesh.faces)], [colors])], "y")
+    assert picture.images[0].shape[1] < 20 * picture.images[0].shape[0]
 
 
 def test_a_checkpoint_knows_its_template(trained):

@@ -275,6 +275,23 @@ def test_results_are_no_sources_and_are_not_overwritten_by_others(cli, trained, 
     assert code == 1 and "holds the match of" in out and "b.ply" in out
 
 
+@pytest.mark.parametrize("words, lost", [
+    (["source=source.ply", "output=."], "source.ply"),
+    (["source=b.ply", "target=target.ply", "output=."], "target.ply"),
+    (["sources=b.ply", "target=out/target.ply", "output=out", "workers=1"], "out/target.ply"),
+    (["source=b.ply", "target=a.ply", "transfer=transferred.npy", "output=."], "transferred.npy"),
+])  # fmt: skip
+def test_no_input_is_overwritten(cli, trained, files, words, lost):  # noqa: F811
+    Path("out").mkdir()
+    np.save("transferred.npy", np.zeros(162))
+    if lost.endswith("ply"):
+        Path("a.ply").rename(lost)
+    before = Path(lost).read_bytes()
+    code, out, err = cli(*words, f"run={trained}", "picture=false", program=main)
+    assert code == 1 and f"{lost} would be overwritten; choose another" in out + err
+    assert Path(lost).read_bytes() == before
+
+
 def test_many_are_matched_and_those_done_are_skipped(cli, trained, files):  # noqa: F811
     (files / "scans").mkdir()
     for i in range(3):

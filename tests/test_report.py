@@ -218,6 +218,21 @@ def test_only_seeds_are_pooled(sweep, tmp_path):
         "FCS-NET, N = 5, folder, precision 64"}  # fmt: skip
 
 
+def test_seeds_that_shuffle_vertices_are_pooled(sweep):
+    [one] = collect(str(sweep / "fcs5"))[0]
+    shuffled = [
+        replace(
+            one,
+            config=one.config
+            | {"seed": seed, "data": one.config["data"] | {"shuffle_vertices": True}},
+            outcome=replace(one.outcome, labels=np.roll(one.outcome.labels, seed)),
+        )
+        for seed in (0, 1)
+    ]
+    [group] = grouped(shuffled)
+    assert group.seeds == {0, 1}
+
+
 def test_a_name_cannot_break_the_page(cli, sweep, tmp_path):  # noqa: F811
     name = "<!--<script> [q] & it's 5 %"
     shutil.copytree(sweep / "fcs5", tmp_path / "odd" / name)

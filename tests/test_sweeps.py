@@ -12,12 +12,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from omegaconf import OmegaConf
 
-from src.runs import CONFIG, LAST, METRICS, write_metrics
-from src.sweeps import FAILED, announce, legal_name, states, sweep_folder
+from src.runs import BEST, CONFIG, LAST, METRICS, RunError, alone, write_metrics
+from src.sweeps import FAILED, announce, legal_name, run_folder, states, sweep_folder
 from tests.test_cli import QUICK, cli  # noqa: F401
-from tests.test_train import FIGURES, ROOT, run, weights
+from tests.test_train import FIGURES, ROOT, program_process, run, wait_for, weights
 
 SWEEP = ["-m", "seed=0,1,2", "optim.epochs=12"]
 
@@ -87,6 +88,16 @@ def test_what_failed_is_in_the_table_and_tried_again(cli, toy_overrides, monkeyp
     assert [state for _, state, _ in states(sweep)] == 2 * ["finished"]
 
 
+def test_runs_of_one_second_get_folders_of_their_own(tmp_path):
+    new = str(tmp_path / "12-00-00_fcs")
+    announce()
+    first = run_folder(None, new)
+    assert first == new == run_folder(None, new)  # Hydra asks again
+    announce()  # another command line
+    assert run_folder(None, new) == f"{new}_2"
+    assert run_folder(first, new) == first
+
+
 def test_one_command_one_folder(monkeypatch):
     def folder(*words):
         monkeypatch.setattr(sys, "argv", ["src.train", *words])
@@ -144,9 +155,42 @@ def test_two_processes_measure_what_one_does(toy_overrides, tmp_path):
     assert done.stdout.count("Test on 3 unseen meshes") == 1
     assert [state for _, state, _ in states(tmp_path)] == ["finished"]
     together = json.loads((tmp_path / "job" / METRICS).read_text())
+    with pytest.raises(RunError, match="of a run in 2 processes, this would be 1"):
+        run(tmp_path / "job", [*toy_overrides, "optim.epochs=2"])
+    for path in (tmp_path / "job" / LAST, tmp_path / "job" / BEST):
+        saved = torch.load(path, weights_only=True)
+        del saved["processes"]
+        torch.save(saved, path)
     alone = run(tmp_path / "job", [*toy_overrides, "optim.epochs=2"])  # with the same weights
     for name in sorted(FIGURES - {"seconds/preprocess", "seconds/train"}):
         assert together[name] == pytest.approx(alone[name], rel=1e-5), name
+
+
+def test_a_signal_to_one_process_of_several_stops_all(toy_overrides, tmp_path):
+    ddp = ["trainer=ddp", "trainer.accelerator=cpu", "trainer.devices=2"]
+    process = program_process([*toy_overrides, *ddp, "optim.epochs=500"], tmp_path)
+    wait_for((tmp_path / LAST).exists, process)
+    process.send_signal(signal.SIGTERM)
+    output, _ = process.communicate(timeout=60)  # of all of them: they share the pipe
+    assert process.returncode == 143 and "Traceback" not in output, output
+    assert f"To go on: python -m src.train resume={tmp_path}" in output
+    torch.load(tmp_path / LAST, weights_only=True)
+
+
+def test_a_job_at_which_another_process_is_is_left_to_it(cli, toy_overrides, tmp_path):  # noqa: F811
+    command = ["-m", "seed=0,1", *toy_overrides, *QUICK]
+    sweep = tmp_path / "sweep"
+    (sweep / "seed-0").mkdir(parents=True)
+    with alone(sweep / "seed-0"):
+        code, out, err = cli(*command, f"hydra.sweep.dir={sweep}")
+        assert code == 0, err
+        assert "another process is at it: " in out
+        assert not (sweep / "seed-0" / METRICS).exists()
+        assert (sweep / "seed-1" / METRICS).exists()
+        code, out, err = cli(*toy_overrides, *QUICK, "seed=0", f"hydra.run.dir={sweep}/seed-0")
+        assert code == 1 and "another process is training in" in out + err
+    assert cli(*command, f"hydra.sweep.dir={sweep}")[0] == 0
+    assert [state for _, state, _ in states(sweep)] == 2 * ["finished"]
 
 
 @pytest.mark.parametrize(

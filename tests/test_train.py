@@ -322,6 +322,10 @@ def test_a_damaged_checkpoint_is_one_message(whole_run, toy_overrides, tmp_path)
         with pytest.raises(RunError, match=message):
             program.train(config, tmp_path)
     (tmp_path / LAST).write_bytes((folder / LAST).read_bytes())
+    (tmp_path / BEST).write_bytes(b"no")
+    with pytest.raises(RunError, match=r"best\.ckpt is damaged .* without its checkpoints"):
+        program.train(config, tmp_path)
+    (tmp_path / BEST).unlink()
     with pytest.raises(RunError, match="is of another run: its seq_len is 8"):
         program.train(composed([*toy_overrides, "seq_len=9"]), tmp_path)
 
@@ -346,10 +350,24 @@ def test_resume_takes_the_runs_config_and_only_harmless_changes(tmp_path, toy_ov
     assert continued(composed(same), same).seq_len == 8
     faster = [*resume, "trainer.threads=2"]
     assert continued(composed(faster), faster).trainer.threads == 2
+    group = ["data=folder", "data.workers=1", *resume]
+    named = [o for o in toy_overrides if o.startswith("data.")]
+    assert continued(composed([*group, *named]), [*group, *named]).data.workers == 1
     for other in ("seq_len=9", "model=lstm", "seed=4", "optim.lr=0.1", "+metric=true"):
         overrides = [*resume, other]
         with pytest.raises(RunError, match="contradicts the run in"):
             continued(composed(overrides), overrides)
+
+
+def test_a_run_from_before_a_setting_was_added_goes_on(tmp_path, toy_overrides):
+    config = composed(toy_overrides)
+    claim(tmp_path, config)
+    before = OmegaConf.load(tmp_path / CONFIG)
+    del before.data.shuffle_vertices, before.model.metric_layers, before.picture
+    OmegaConf.save(before, tmp_path / CONFIG)
+    claim(tmp_path, config)
+    resume = [f"resume={tmp_path}"]
+    assert continued(composed(resume), resume).model.metric_layers == "all"
 
 
 def test_resume_of_what_is_no_run_is_one_message(tmp_path):

@@ -66,9 +66,10 @@ def rotate(batch: Batch, *purpose: int | str) -> Batch:
 
 def described_tensors(arrays: Arrays, mesh: Mesh, recipe: Recipe) -> Batch:
     """`features`, `vertices` and `unit` of `MeshDataset`; arrays: of a `descriptor_task`."""
+    centred = mesh.vertices - mesh.vertices.mean(axis=0)  # float32 has no digits left far away
     return {
         "features": torch.from_numpy(arrays["features"]),
-        "vertices": torch.from_numpy(mesh.vertices.astype(np.float32)),
+        "vertices": torch.from_numpy(centred.astype(np.float32)),
         "unit": torch.tensor(recipe.shot_radius * np.sqrt(mesh.area), dtype=torch.float32),
     }
 

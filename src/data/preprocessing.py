@@ -9,9 +9,11 @@ from dataclasses import astuple, dataclass
 
 import numpy as np
 from joblib import Parallel, cpu_count, delayed
+from joblib.externals.loky.process_executor import TerminatedWorkerError
 from scipy.sparse import csr_array
 from tqdm import tqdm
 
+from src.data.shapes import DataError
 from src.data.store import Arrays, Store, code_version, digest
 from src.geometry import angles, connectivity, geodesics, mesh, patches, shot, spirals, windows
 from src.geometry.mesh import Mesh, MeshError
@@ -170,8 +172,12 @@ def _run(task: Task, store: Store) -> None:
 def _run_in_pool(tasks: list[Task], store: Store, workers: int, progress: tqdm) -> None:
     # idle workers would stay for five minutes, with their memory
     pool = Parallel(n_jobs=workers, return_as="generator_unordered", idle_worker_timeout=2)
-    for _ in pool(delayed(_run)(task, store) for task in tasks):
-        progress.update()
+    try:
+        for _ in pool(delayed(_run)(task, store) for task in tasks):
+            progress.update()
+    except TerminatedWorkerError as error:
+        raise DataError("a process was killed, probably for lack of memory: data.workers=1 needs "
+                        "less; the same command goes on") from error  # fmt: skip
 
 
 def load_task(task: Task, store: Store) -> Arrays:

@@ -6,7 +6,7 @@ import hashlib
 import inspect
 import logging
 import os
-import tempfile
+import uuid
 import zipfile
 import zlib
 from collections.abc import Callable
@@ -80,16 +80,14 @@ class Store:
     def save(self, kind: str, key: str, arrays: Arrays) -> None:
         """Keep arrays under a key. Errors: StoreError if the folder can't be written."""
         path = self.path(kind, key)
-        temporary = None
+        temporary = path.with_name(f"{uuid.uuid4().hex}.tmp")
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
-            with tempfile.NamedTemporaryFile(dir=path.parent, suffix=".tmp", delete=False) as file:
-                temporary = file.name
+            with open(temporary, "xb") as file:  # as readable for others as the umask says
                 np.savez(file, key=np.array([key, *sorted(arrays)]), **arrays)
             os.replace(temporary, path)
         except BaseException as error:
-            if temporary is not None and os.path.exists(temporary):
-                os.unlink(temporary)
+            temporary.unlink(missing_ok=True)
             if isinstance(error, OSError):
                 reason = error.strerror or error
                 raise StoreError(

@@ -1,6 +1,7 @@
 """What a network is served: the right tensors, fresh spirals, and nothing of the numbering."""
 
 import logging
+import os
 from dataclasses import replace
 from itertools import pairwise
 
@@ -8,12 +9,14 @@ import lightning as L
 import numpy as np
 import pytest
 import torch
+from tqdm import tqdm
 
 from src.data import preprocessing
 from src.data.datamodule import CorrespondenceData, EpochSampler, draw_spirals
 from src.data.preprocessing import (
     PatchRecipe,
     Recipe,
+    Task,
     by_rows_and_columns,
     descriptor_task,
     first_directions,
@@ -29,6 +32,7 @@ from src.geometry.patches import geodesic_patches
 from src.geometry.shot import shot_descriptors
 from src.geometry.spirals import spiral_table
 from src.geometry.windows import gaussian_windows
+from src.nn.layers import metric_features
 from tests.conftest import TOY_SPLIT, toy_shapes
 from tests.meshes import bumpy_sphere, lattice, punctured, union
 
@@ -404,6 +408,21 @@ def test_a_mesh_far_from_the_origin_has_the_same_descriptors(store):
     near = preprocessing._descriptors(mesh, 0.3, 4)["features"]
     far = preprocessing._descriptors(Mesh(mesh.vertices + 1e4, mesh.faces), 0.3, 4)["features"]
     assert (np.abs(far - near).max(axis=1) < 1e-3).mean() > 0.98
+
+
+def test_a_mesh_far_from_the_origin_has_the_same_metric_information(store):
+    near = toy_shapes()
+    far = {name: Mesh(mesh.vertices + 4e6, mesh.faces) for name, mesh in near.items()}
+    one, two = (serve(store, shapes=shapes).datasets["val"].items[0] for shapes in (near, far))
+    spirals = one["sequences"][one["first"][:-1]].long()
+    one, two = (metric_features(item["vertices"], spirals, item["unit"]) for item in (one, two))
+    torch.testing.assert_close(one, two, rtol=0, atol=1e-5)
+
+
+def test_a_killed_process_of_the_pool_is_one_message(store):
+    tasks = [Task("shot", str(i), os._exit, (1,)) for i in range(2)]
+    with pytest.raises(DataError, match=r"data\.workers=1 needs less"):
+        preprocessing._run_in_pool(tasks, store, 2, tqdm(disable=True))
 
 
 def test_labels_outside_the_template_are_refused():

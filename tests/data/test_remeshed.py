@@ -130,6 +130,8 @@ def test_the_meshes_of_a_data_set_in_a_table(cli, toy_overrides):  # noqa: F811
     code, out, err = cli(*data, "split=test", program=main)  # as registered
     lines = [line.split() for line in out.splitlines() if line.startswith("test_")]
     assert code == 0 and all(line[8:] == ["1.00", "-", "-"] for line in lines)
+    code, out, err = cli(*data, "data.val=[]", "split=val", program=main)
+    assert code == 1 and "has no mesh in its split val" in out + err
 
 
 @pytest.mark.parametrize(

@@ -2,6 +2,7 @@
 
 import logging
 import multiprocessing
+import os
 import zipfile
 
 import numpy as np
@@ -30,6 +31,14 @@ def test_what_is_saved_is_loaded_and_nothing_else_lies_about(store):
     assert same(store.load("kind", "key"))
     assert [p.name for p in store.root.rglob("*") if p.is_file()] == ["key.npz"]
     assert store.size() == store.path("kind", "key").stat().st_size
+
+
+@pytest.mark.skipif(os.name == "nt", reason="Windows has no such modes")
+def test_others_may_read_what_the_umask_lets_them(store):
+    store.save("shot", "a", {"x": np.zeros(2)})
+    umask = os.umask(0)
+    os.umask(umask)
+    assert store.path("shot", "a").stat().st_mode & 0o777 == 0o666 & ~umask
 
 
 def test_a_result_is_computed_once(store):
