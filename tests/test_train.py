@@ -350,9 +350,9 @@ def test_resume_takes_the_runs_config_and_only_harmless_changes(tmp_path, toy_ov
     assert continued(composed(same), same).seq_len == 8
     faster = [*resume, "trainer.threads=2"]
     assert continued(composed(faster), faster).trainer.threads == 2
-    group = ["data=folder", "data.workers=1", *resume]
-    named = [o for o in toy_overrides if o.startswith("data.")]
-    assert continued(composed([*group, *named]), [*group, *named]).data.workers == 1
+    group = ["data=folder", *resume]
+    named = [*(o for o in toy_overrides if o.startswith("data.")), "data.workers=3"]
+    assert continued(composed([*group, *named]), [*group, *named]).data.workers == 3
     for other in ("seq_len=9", "model=lstm", "seed=4", "optim.lr=0.1", "+metric=true"):
         overrides = [*resume, other]
         with pytest.raises(RunError, match="contradicts the run in"):
