@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import io
 import os
 import signal
@@ -31,7 +32,7 @@ class WholeFiles(TorchCheckpointIO):
     def save_checkpoint(self, checkpoint: dict[str, Any], path: Any, storage_options=None) -> None:
         path = Path(path)
         path.parent.mkdir(parents=True, exist_ok=True)
-        temporary = path.with_name(f"{path.name}.{os.getpid()}.tmp")
+        temporary = path.with_name(f"{path.name}.tmp")
         try:
             whole = io.BytesIO()  # torch.save to a full disk would not say that it is full
             torch.save(checkpoint, whole)
@@ -41,7 +42,8 @@ class WholeFiles(TorchCheckpointIO):
                 os.fsync(file.fileno())
             os.replace(temporary, path)
         except OSError as error:
-            temporary.unlink(missing_ok=True)
+            with contextlib.suppress(OSError):
+                temporary.unlink()
             reason = error.strerror or error
             raise OSError(f"cannot write the checkpoint {path} ({reason})") from error
 
@@ -230,26 +232,25 @@ class OrderlyStop(Callback):
     def on_train_batch_start(self, trainer, module, batch, batch_idx) -> None:
         # Between two steps, and not before the last of an epoch: there Lightning can't tell a
         # finished epoch from an unfinished one. The start of an epoch is in last.ckpt already.
-        self._hear(trainer)
-        if self.signum is None or 0 < batch_idx == trainer.num_training_batches - 1:
+        signum = self._heard(trainer)
+        if signum is None or 0 < batch_idx == trainer.num_training_batches - 1:
             return
-        last = self.folder / LAST
-        if batch_idx > 0 or not last.exists():
-            trainer.save_checkpoint(last)
-        raise Stopped(self.signum)
+        if batch_idx > 0 or trainer.global_step == 0:
+            trainer.save_checkpoint(self.folder / LAST)
+        raise Stopped(signum)
 
-    def _hear(self, trainer: L.Trainer) -> None:
-        """Of several processes, a signal may have come to one alone: all stop at the same step."""
-        if trainer.world_size > 1 and trainer.strategy.reduce_boolean_decision(
-            self.signum is not None, all=False
-        ):
-            self.signum = self.signum or signal.SIGTERM
+    def _heard(self, trainer: L.Trainer) -> int | None:
+        """The signal that has come to this process, or to one of several: all stop at one step."""
+        if trainer.world_size == 1:
+            return self.signum
+        anywhere = trainer.strategy.reduce_boolean_decision(self.signum is not None, all=False)
+        return self.signum or (signal.SIGTERM if anywhere else None)
 
     def on_train_end(self, trainer: L.Trainer, module: L.LightningModule) -> None:
-        self._hear(trainer)
+        signum = self._heard(trainer)
         self._restore()
-        if self.signum is not None:
-            raise Stopped(self.signum)
+        if signum is not None:
+            raise Stopped(signum)
 
     def teardown(self, trainer: L.Trainer, module: L.LightningModule, stage: str) -> None:
         self._restore()

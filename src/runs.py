@@ -70,6 +70,11 @@ def claim(folder: Path, config: DictConfig) -> None:
     write_whole(path, OmegaConf.to_yaml(config, resolve=True))
 
 
+def is_first() -> bool:
+    """Whether this is the first of a run's processes, as those who start them say."""
+    return not any(int(os.environ.get(key, 0)) for key in ("RANK", "LOCAL_RANK", "SLURM_PROCID"))
+
+
 @contextlib.contextmanager
 def alone(folder: Path) -> Iterator[None]:
     """While this process trains there no other does; the system lets go of what a killed one held.
@@ -79,12 +84,21 @@ def alone(folder: Path) -> Iterator[None]:
         lock.acquire()
     except Timeout as error:
         raise InUse(f"another process is training in {folder}") from error
-    except NotImplementedError:  # a file system without locks
+    except (NotImplementedError, OSError):  # a file system without locks
         pass
     try:
         yield
     finally:
         lock.release()
+
+
+def in_use(folder: Path) -> bool:
+    """Whether another process is training there."""
+    try:
+        with alone(folder):
+            return False
+    except InUse:
+        return True
 
 
 def differences(config: DictConfig, stored: DictConfig) -> list[str]:

@@ -18,7 +18,7 @@ from hydra.errors import HydraException
 from hydra.experimental.callback import Callback
 from omegaconf import DictConfig, OmegaConf
 
-from src.runs import CONFIG, LAST, METRICS, write_whole
+from src.runs import CONFIG, LAST, METRICS, in_use, is_first, write_whole
 
 FAILED = "failed.txt"  # in the folder of a job that failed: why, in a line
 COMMAND = "SPIRAL_COMMAND"  # in the environment: the words of the command line, for jobs elsewhere
@@ -40,6 +40,8 @@ def run_folder(resume: str | None, new: str) -> str:
 def _fresh(name: str) -> str:
     """A folder of that name that nobody else has, made for this command line: runs that are started
     at the same second get a number."""
+    if not is_first():
+        return name
     for number in itertools.count(1):
         folder = name if number == 1 else f"{name}_{number}"
         try:
@@ -103,7 +105,9 @@ def states(folder: Path) -> list[tuple[str, str, str]]:
             found.append((job.name, "finished", f"{100 * exact:.2f} % exact, error {error:.4f}"))
         elif (job / CONFIG).is_file():
             how = "goes on with the same command" if (job / LAST).is_file() else "no epoch yet"
-            found.append((job.name, "stopped", how))
+            found.append(
+                (job.name, *(("running", "elsewhere") if in_use(job) else ("stopped", how)))
+            )
     return found
 
 

@@ -24,6 +24,7 @@ from src.runs import (
     alone,
     claim,
     continued,
+    is_first,
     read_checkpoint,
     write_metrics,
 )
@@ -46,23 +47,23 @@ def main(config: DictConfig) -> None:
     else:
         claim(folder, config)
     in_sweep = hydra.mode == RunMode.MULTIRUN
-    if in_sweep and (folder / METRICS).is_file():
-        log.info("finished before: %s", folder)
-        return
+    apart = in_sweep and config.trainer.strategy != "auto"
     try:
-        if in_sweep and config.trainer.strategy != "auto":
-            train_apart(folder)
-        else:
-            from lightning.pytorch.utilities import rank_zero_only
-
-            first = rank_zero_only.rank == 0  # of the processes of this run
-            with alone(folder) if first else contextlib.nullcontext():
+        with alone(folder) if is_first() else contextlib.nullcontext():
+            if in_sweep and (folder / METRICS).is_file():
+                log.info("finished before: %s", folder)
+                return
+            if not apart:
                 train(config, folder)
+        if apart:
+            train_apart(folder)
     except InUse:
         if not in_sweep:
             raise
         log.info("another process is at it: %s", folder)
     except Stopped as stopped:
+        if not is_first():
+            sys.exit()  # with another code, Lightning would kill the first
         resume = f"python -m src.train {shlex.quote(f'resume={folder}')}"
         how = "the same command" if in_sweep else resume
         raise Stopped(stopped.signum, f"Stopped. To go on: {how}") from None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import inspect
 import logging
@@ -87,7 +88,8 @@ class Store:
                 np.savez(file, key=np.array([key, *sorted(arrays)]), **arrays)
             os.replace(temporary, path)
         except BaseException as error:
-            temporary.unlink(missing_ok=True)
+            with contextlib.suppress(OSError):
+                temporary.unlink()
             if isinstance(error, OSError):
                 reason = error.strerror or error
                 raise StoreError(
