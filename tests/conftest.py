@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
+import os
+import signal
+import subprocess
 from pathlib import Path
 
 import numpy as np
@@ -36,6 +40,18 @@ def toy(tmp_path_factory) -> Path:
         path.parent.mkdir(exist_ok=True)
         trimesh.Trimesh(mesh.vertices, mesh.faces, process=False).export(path)
     return root
+
+
+STARTED: list[subprocess.Popen] = []  # by tests, in sessions of their own
+
+
+@pytest.fixture(autouse=True)
+def nothing_goes_on():
+    """Whatever became of a test, its processes end with it."""
+    yield
+    while STARTED:
+        with contextlib.suppress(ProcessLookupError):
+            os.killpg(STARTED.pop().pid, signal.SIGKILL)
 
 
 @pytest.fixture(scope="session")

@@ -18,6 +18,7 @@ import trimesh
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from src.data.bodies import Bodies
 from src.data.scans import open_scan, scan
 from src.geometry.mesh import Mesh, MeshError
 from src.match import main, named
@@ -65,6 +66,13 @@ def labels(points, confidence):
     points = np.array(points, dtype=float).reshape(-1, 1) * [1.0, 0.0, 0.0]
     template = np.where(np.isnan(points[:, 0]), -1, 7).astype(np.int32)
     return Labels(template, points, np.array(confidence, dtype=np.float32))
+
+
+def test_the_network_that_comes_along_knows_bodies():
+    shapes = Bodies(1500)
+    mesh = shapes.load("s9_squat").mesh
+    found = Matcher.load().label(scan(mesh.vertices, mesh.faces, "a"))
+    assert (found.template == np.arange(1500)).mean() > 0.5
 
 
 def test_the_map_goes_to_the_nearest_place_on_the_template():
@@ -243,6 +251,9 @@ def test_the_map_is_of_the_users_vertices_after_a_repair(cli, trained, files):  
     assert len(match) == 167 and (match == -1).sum() == 1 and match[50] == -1
     np.testing.assert_array_equal(match[162:], match[:5])
     assert "5 vertices joined with others" in out
+    np.save("x.npy", np.arange(1, 163))
+    assert cli(*common, "repair=true", "transfer=x.npy", program=main)[0] == 0
+    np.testing.assert_array_equal(np.load("out/transferred.npy"), np.where(match < 0, 0, match + 1))
 
 
 def test_what_a_repair_cut_open_is_drawn(cli, trained, files):  # noqa: F811
@@ -300,7 +311,7 @@ def test_many_are_matched_and_those_done_are_skipped(cli, trained, files):  # no
     Path("scans/broken.ply").write_text("no mesh")
     Path("scans/notes.txt").write_text("no mesh either")
     common = ["sources='scans/*'", "target=b.ply", f"run={trained}", "output=out", "workers=1"]
-    code, out, _ = cli(*common, program=main)
+    code, out, _ = cli(*common[:-1], "workers=2", program=main)
     assert code == 1 and "1 of 4 meshes were refused; out/refused.txt" in out
     assert "broken.ply: not a readable PLY" in Path("out/refused.txt").read_text()
     assert "3 meshes matched" in out

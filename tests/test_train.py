@@ -24,8 +24,10 @@ from src.callbacks import Checkpoint, Looks, Speed, WholeFiles
 from src.cli import CONF
 from src.config import checked
 from src.correspondence import Correspondence
+from src.data.datamodule import rotate
 from src.data.sources import open_data
 from src.runs import BEST, CONFIG, LAST, METRICS, RunError, Stopped, claim, continued
+from tests.conftest import STARTED
 
 ROOT = Path(CONF).parent
 
@@ -113,7 +115,10 @@ def test_pictures_in_tensorboard_take_one_per_cent_of_the_time_at_most():
     looks.on_validation_end(trainer, None)
     looks.on_validation_end(trainer, None)
     assert len(drawn) == 1
-    looks._began -= 6  # as if six seconds had gone by
+    looks._began -= 80 * looks._spent  # as if so much time had gone by
+    looks.on_validation_end(trainer, None)
+    assert len(drawn) == 1
+    looks._began -= 30 * looks._spent
     looks.on_validation_end(trainer, None)
     assert len(drawn) == 2
     trainer.state.fn = "validate"  # on its own
@@ -131,12 +136,16 @@ def test_a_checkpoint_is_all_that_evaluation_needs(whole_run):
     module = Correspondence.load_from_checkpoint(folder / BEST, weights_only=True).eval()
     data = open_data(config)
     data.prepare(["test"])
-    right = []
+    right, losses = [], []
     for item in data.datasets["test"]:
-        first_rows = item["sequences"][item["first"][:-1]].long()  # any start will nearly do
+        spirals = rotate(item, config["seed"], "spirals", "evaluation")["spirals"]
         with torch.no_grad():
-            right.append(module.net(item["features"], first_rows).argmax(1) == item["labels"])
-    assert torch.cat(right).float().mean() == pytest.approx(metrics["test/exact_match"], abs=0.06)
+            scores = module.net(item["features"], spirals)
+        right.append(scores.argmax(1) == item["labels"])
+        losses.append(torch.nn.functional.cross_entropy(scores, item["labels"]))
+    exact = torch.cat(right).double().mean().item()
+    assert exact == pytest.approx(metrics["test/exact_match"], abs=1e-6)
+    assert torch.stack(losses).mean().item() == pytest.approx(metrics["test/loss"], rel=1e-4)
 
 
 def test_geodesic_errors_over_area_and_over_diameter_have_one_ratio(whole_run):
@@ -162,17 +171,24 @@ def test_validation_figures_are_of_one_epoch_and_all_its_meshes(whole_run):
     assert module.figures["val"] == pytest.approx(saved)
 
 
-def test_the_learning_rate_warms_up_and_follows_half_a_cosine(whole_run):
+def test_the_learning_rate_warms_up_and_follows_half_a_cosine(whole_run, toy_overrides):
     from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-    config = OmegaConf.load(whole_run[0] / CONFIG).optim
-    steps, warmup = 24, round(config.warmup * 24)
+    config = OmegaConf.to_container(composed(toy_overrides))
+    module = Correspondence(config, 160, 162)
+    module._trainer = SimpleNamespace(estimated_stepping_batches=24)
+    [factor] = module.configure_optimizers()["lr_scheduler"]["scheduler"].lr_lambdas
+    warmup = 4  # 0.15 of 24, rounded
+    expected = [(step + 1) / warmup for step in range(warmup)]
+    expected += [
+        0.5 * (1 + np.cos(np.pi * (s - warmup) / (24 - warmup))) for s in range(warmup, 24)
+    ]
+    np.testing.assert_allclose([factor(step) for step in range(24)], expected)
     events = EventAccumulator(str(whole_run[0])).Reload().Scalars("lr-Adam")
     assert len(events) >= 2
     for event in events:
-        done = (event.step - warmup) / (steps - warmup)
-        shape = (event.step + 1) / warmup if done < 0 else 0.5 * (1 + np.cos(np.pi * done))
-        assert event.value == pytest.approx(config.lr * shape, rel=1e-5)
+        rate = config["optim"]["lr"] * expected[event.step]
+        assert event.value == pytest.approx(rate, rel=1e-5)
 
 
 def test_dropout_differs_between_meshes_and_epochs_and_not_between_runs(toy_overrides):
@@ -185,6 +201,9 @@ def test_dropout_differs_between_meshes_and_epochs_and_not_between_runs(toy_over
 
     assert len({draw(mesh) for mesh in range(5)}) == 5
     assert draw(2) == draw(2)
+    before = draw(2)
+    module._trainer = SimpleNamespace(current_epoch=1)
+    assert draw(2) != before
 
 
 # ---------------------------------------------------------------------------------- repeatability
@@ -199,14 +218,18 @@ def test_two_runs_with_one_seed_agree_to_the_bit_and_another_seed_differs(
     assert {k: v for k, v in again.items() if "seconds" not in k} == {
         k: v for k, v in metrics.items() if "seconds" not in k
     }
-    run(tmp_path / "other", [*toy_overrides, "seed=1", "optim.epochs=1"])
+    run(tmp_path / "other", [*toy_overrides, "seed=1"])
     assert not same_weights(folder, tmp_path / "other")
 
 
-@pytest.mark.parametrize("model", ["lstm", "gcnn3"])
-def test_so_do_runs_of_the_other_networks(model, toy_overrides, tmp_path):
+@pytest.mark.parametrize("model", ["fcs", "lstm", "gcnn3"])
+def test_so_do_runs_of_all_networks_on_two_threads(model, toy_overrides, tmp_path):
+    threads = torch.get_num_threads()
+    several = ["trainer.threads=2", "model.channels=[100,150,200]", "optim.epochs=2"]
     for name in "ab":
-        run(tmp_path / name, [*toy_overrides, f"model={model}", "optim.epochs=2"])
+        run(tmp_path / name, [*toy_overrides, f"model={model}", *several])
+        assert torch.get_num_threads() == 2
+    torch.set_num_threads(threads)
     assert same_weights(tmp_path / "a", tmp_path / "b")
 
 
@@ -246,8 +269,10 @@ def test_a_stopped_run_goes_on_as_if_it_had_not_been(
 
 def program_process(overrides, folder) -> subprocess.Popen:
     command = [sys.executable, "-m", "src.train", *overrides, f"hydra.run.dir={folder}"]
-    return subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.STDOUT,
-                            text=True, start_new_session=True)  # fmt: skip
+    process = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.STDOUT,
+                               text=True, start_new_session=True)  # fmt: skip
+    STARTED.append(process)
+    return process
 
 
 def wait_for(condition, process, seconds=120):

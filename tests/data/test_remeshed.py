@@ -11,6 +11,7 @@ from src.data.remeshed import Remeshed
 from src.data.shapes import DataError, ShapeSet, registered_shape
 from src.data.sources import open_shapes
 from src.data.store import Store
+from src.evaluation import ERRORS, Outcome
 from src.geometry import remesh as module
 from src.meshes import edges, main, shared
 from src.runs import METRICS
@@ -114,7 +115,8 @@ REMESH = ["+data.remesh.policy=mixed", "+data.remesh.vertices=120"]
 def test_networks_train_on_remeshed_shapes(toy_overrides, tmp_path, model):
     metrics = run(tmp_path, [*toy_overrides, *REMESH, *model, "optim.epochs=1"])
     assert metrics.keys() >= FIGURES
-    assert metrics["test/within_0.01"] < 0.2  # hardly any truth is a vertex
+    outcome = Outcome.load(tmp_path / ERRORS)
+    assert (outcome.errors != outcome.label_errors).mean() > 0.9  # hardly any truth is a vertex
     assert json.loads((tmp_path / METRICS).read_text()) == metrics
 
 

@@ -3,6 +3,7 @@
 import logging
 import multiprocessing
 import os
+import time
 import zipfile
 
 import numpy as np
@@ -184,6 +185,9 @@ def test_eight_processes_share_a_cold_cache_and_one_is_killed(tmp_path, caplog):
     for process in processes:
         process.start()
     assert started.acquire(timeout=60)
+    end = time.monotonic() + 60
+    while not any((tmp_path / "all").rglob("*.npz")):  # until they are at it
+        assert time.monotonic() < end
     processes[0].kill()  # in the middle, wherever that is
     for process in processes:
         process.join(120)

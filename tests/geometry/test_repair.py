@@ -74,7 +74,7 @@ def test_turned_faces_turn_back():
     faces[[3, 17, 40]] = faces[[3, 17, 40], ::-1]
     found = repair(SPHERE.vertices, faces, "a")
     assert found.changes == ["3 faces turned to agree with their neighbours"]
-    assert abs(found.mesh.area - SPHERE.area) < 1e-12
+    np.testing.assert_allclose(found.mesh.vertex_normals, SPHERE.vertex_normals, atol=1e-12)
 
 
 def test_a_moebius_strip_is_cut_open_once():
@@ -90,7 +90,7 @@ def test_a_moebius_strip_is_cut_open_once():
         c, d = (i + 1, i + 1 + n) if i < n - 1 else (n, 0)
         faces += [[a, c, b], [c, d, b]]
     found = repair(vertices, np.array(faces), "a")
-    assert found.changes[-1].endswith("edges cut open where the faces can't agree")
+    assert found.changes[-1] == "1 edges cut open where the faces can't agree"
     assert len(found.mesh.faces) == 2 * n
 
 
