@@ -103,11 +103,11 @@ def states(folder: Path) -> list[tuple[str, str, str]]:
             metrics = json.loads((job / METRICS).read_text())
             exact, error = metrics["test/exact_match"], metrics["test/geodesic_error"]
             found.append((job.name, "finished", f"{100 * exact:.2f} % exact, error {error:.4f}"))
+        elif (job / CONFIG).is_file() and in_use(job):
+            found.append((job.name, "running", "elsewhere"))
         elif (job / CONFIG).is_file():
             how = "goes on with the same command" if (job / LAST).is_file() else "no epoch yet"
-            found.append(
-                (job.name, *(("running", "elsewhere") if in_use(job) else ("stopped", how)))
-            )
+            found.append((job.name, "stopped", how))
     return found
 
 

@@ -112,12 +112,11 @@ def train(config: DictConfig, folder: Path) -> dict[str, float]:
     for line in describe(config, data, parameters, trainer.precision, seconds):
         log.info(line)
 
-    last = folder / LAST
+    last = folder / LAST if (folder / LAST).exists() else None
     for checkpoint in (last, folder / BEST):
-        if last.exists() and checkpoint.exists():
+        if last and checkpoint.exists():
             check(checkpoint, plain, trainer.world_size)
-    trainer.fit(module, datamodule=data, weights_only=True,
-                ckpt_path=last if last.exists() else None)  # fmt: skip
+    trainer.fit(module, datamodule=data, weights_only=True, ckpt_path=last)
     [tested] = trainer.test(module, datamodule=data, ckpt_path=folder / BEST, weights_only=True,
                             verbose=False)  # fmt: skip
     metrics = {
