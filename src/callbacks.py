@@ -244,7 +244,9 @@ class OrderlyStop(Callback):
         if trainer.world_size == 1:
             return self.signum
         anywhere = trainer.strategy.reduce_boolean_decision(self.signum is not None, all=False)
-        return self.signum or (signal.SIGTERM if anywhere else None)
+        if not anywhere:  # one that came since is for the next step: the others don't know of it
+            return None
+        return self.signum or signal.SIGTERM
 
     def on_train_end(self, trainer: L.Trainer, module: L.LightningModule) -> None:
         signum = self._heard(trainer)

@@ -9,13 +9,15 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import torch
 from omegaconf import OmegaConf
 
-from src.runs import BEST, CONFIG, LAST, METRICS, RunError, alone, write_metrics
+from src.callbacks import OrderlyStop
+from src.runs import BEST, CONFIG, LAST, METRICS, RunError, Stopped, alone, write_metrics
 from src.sweeps import FAILED, announce, legal_name, run_folder, states, sweep_folder
 from tests.test_cli import QUICK, cli  # noqa: F401
 from tests.test_train import FIGURES, ROOT, program_process, run, wait_for, weights
@@ -175,6 +177,22 @@ def test_a_signal_to_one_process_of_several_stops_all(toy_overrides, tmp_path):
     assert process.returncode == 143 and "Traceback" not in output, output
     assert output.count(f"To go on: python -m src.train resume={tmp_path}") == 1
     torch.load(tmp_path / LAST, weights_only=True)
+
+
+def test_a_signal_while_the_processes_agree_waits_for_the_next_step(tmp_path):
+    stop = OrderlyStop(tmp_path)
+
+    def agree(decision, all):
+        stop.signum = signal.SIGINT  # comes when the others have been told that there is none
+        return decision
+
+    strategy = SimpleNamespace(reduce_boolean_decision=agree)
+    trainer = SimpleNamespace(world_size=2, strategy=strategy, num_training_batches=9,
+                              global_step=1)  # fmt: skip
+    stop.on_train_batch_start(trainer, None, None, 0)
+    with pytest.raises(Stopped) as stopped:
+        stop.on_train_batch_start(trainer, None, None, 0)
+    assert stopped.value.signum == signal.SIGINT
 
 
 def test_a_job_at_which_another_process_is_is_left_to_it(cli, toy_overrides, tmp_path):  # noqa: F811
