@@ -8,6 +8,8 @@ import signal
 import subprocess
 from pathlib import Path
 
+os.environ.setdefault("OMP_NUM_THREADS", "1")  # read by torch: tests run on all cores already
+
 import numpy as np
 import pytest
 import trimesh
