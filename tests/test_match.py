@@ -27,7 +27,7 @@ from src.runs import BEST, RunError
 from tests.conftest import toy_shapes
 from tests.damage import damaged_file
 from tests.test_cli import cli  # noqa: F401
-from tests.test_train import ROOT, run
+from tests.test_train import ROOT, die, run
 
 TOYS = toy_shapes()
 SOURCE, TARGET = TOYS["test/0.ply"], TOYS["test/1.ply"]
@@ -274,6 +274,15 @@ def test_what_a_repair_cut_open_is_drawn(cli, trained, files):  # noqa: F811
     assert "cut open" in Path("many/a/remarks.txt").read_text()
     code, out, _ = cli(*sources, "picture=true", program=main)
     assert code == 0 and Path("many/a/correspondence.png").exists()
+
+
+def test_without_opengl_a_match_has_no_pictures(cli, trained, files, monkeypatch):  # noqa: F811
+    monkeypatch.setattr("src.render._render", die)
+    Path("out").mkdir()
+    Path("out/correspondence.png").touch()  # of another match, before
+    code, out, err = cli("source=a.ply", f"run={trained}", "output=out", program=main)
+    assert code == 0 and "no pictures: VTK could not draw" in out + err
+    assert Path("out/template.txt").exists() and not list(Path("out").glob("*.png"))
 
 
 def test_results_are_no_sources_and_are_not_overwritten_by_others(cli, trained, files):  # noqa: F811
