@@ -6,7 +6,8 @@ import io
 from collections.abc import Mapping
 
 import numpy as np
-from matplotlib import colormaps, rc_context
+from cycler import cycler
+from matplotlib import colormaps, rc_context, rcParams
 from matplotlib.cm import ScalarMappable
 from matplotlib.collections import PolyCollection
 from matplotlib.colors import Normalize
@@ -18,6 +19,7 @@ ERROR_LABEL = r"geodesic error / $\sqrt{\mathrm{area}}$"
 MOST_ERROR = 0.2  # where colours end, as in the paper
 ERROR_COLORS = colormaps["magma_r"]  # darker with every step, also in greyscale
 DPI = 160
+IN_A_CORNER = 8  # curves whose names leave room for the curves
 
 
 def curve_figure(curves: Mapping[str, tuple[np.ndarray, np.ndarray]]) -> Figure:
@@ -26,8 +28,11 @@ def curve_figure(curves: Mapping[str, tuple[np.ndarray, np.ndarray]]) -> Figure:
     curves: by name, thresholds [T] over sqrt(area), and shares in 0..1: [T], or [R, T] of several
     runs: their mean, and a band from the least to the most.
     """
-    figure = Figure(figsize=(4.8, 3.6), layout="constrained")
+    many = len(curves) > IN_A_CORNER
+    size = (7.4, max(3.6, 0.19 * len(curves) + 0.2)) if many else (4.8, 3.6)
+    figure = Figure(figsize=size, layout="constrained")
     axes = figure.add_subplot()
+    axes.set_prop_cycle(cycler(linestyle=("-", "--", ":", "-.")) * rcParams["axes.prop_cycle"])
     for name, (thresholds, shares) in curves.items():
         several = 100 * np.atleast_2d(shares)
         [line] = axes.plot(thresholds, several.mean(axis=0), label=name, linewidth=1.6)
@@ -37,7 +42,10 @@ def curve_figure(curves: Mapping[str, tuple[np.ndarray, np.ndarray]]) -> Figure:
     axes.set(xlabel=ERROR_LABEL, ylabel="correct matches (%)", xlim=(0, thresholds[-1]),
              ylim=(0, 100))  # fmt: skip
     axes.grid(alpha=0.3)
-    axes.legend(loc="lower right", fontsize="small")
+    if many:
+        figure.legend(loc="outside right upper", fontsize="small")
+    else:
+        axes.legend(loc="lower right", fontsize="small")
     return figure
 
 

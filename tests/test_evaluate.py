@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 from omegaconf import OmegaConf
 
 from src.data.datamodule import CorrespondenceData
@@ -319,6 +320,18 @@ def test_shapes_are_chosen_evenly():
 def test_error_colours_darken_and_end_at_a_fifth():
     grey = error_colors(np.linspace(0, 0.3, 31)) @ [0.299, 0.587, 0.114]
     assert (np.diff(grey[:21]) < 0).all() and (np.diff(grey[20:]) == 0).all()
+
+
+def test_no_two_curves_look_alike_and_no_name_covers_one():
+    curves = {f"run {i}": (THRESHOLDS, np.full(len(THRESHOLDS), i / 24)) for i in range(24)}
+    figure = curve_figure(curves)
+    [axes] = figure.axes
+    assert len({(line.get_color(), line.get_linestyle()) for line in axes.lines}) == 24
+    FigureCanvasAgg(figure).draw()
+    [legend] = figure.legends
+    names = legend.get_window_extent()
+    assert len(legend.get_texts()) == 24
+    assert names.x0 >= axes.get_window_extent().x1 and names.y0 >= 0
 
 
 def test_curves_of_several_runs_have_a_band():
