@@ -6,8 +6,7 @@ import io
 from collections.abc import Mapping
 
 import numpy as np
-from cycler import cycler
-from matplotlib import colormaps, rc_context, rcParams
+from matplotlib import colormaps, cycler, rc_context, rcParams
 from matplotlib.cm import ScalarMappable
 from matplotlib.collections import PolyCollection
 from matplotlib.colors import Normalize
