@@ -37,12 +37,13 @@ class Remeshed(NamedTuple):
 def remesh(mesh: Mesh, vertices: int, policy: str = "isotropic", seed: int = 0) -> Remeshed:
     """The surface with other vertices and faces, in random order.
 
-    vertices: how many; "marching" may give a few per cent fewer. policy: one of POLICIES:
-    isotropic: edges of one length; adaptive: shorter where the surface is curved; refined: shorter
-    around four random places; simplified: a fine mesh reduced by quadrics, its triangles stretched
-    along the flat directions; marching: marching cubes, with slivers, and thin parts lost; mixed:
-    one of these, drawn by the seed. Errors: MeshError for fewer than 12 vertices, for another
-    policy, for a mesh that PyMeshLab can't remesh to that size, or without PyMeshLab.
+    vertices: how many; "marching" and open surfaces may have some per cent fewer. policy: one of
+    POLICIES: isotropic: edges of one length; adaptive: shorter where the surface is curved, see
+    `bending`; refined: shorter around four random places; simplified: a fine mesh reduced by
+    quadrics, its triangles stretched along the flat directions; marching: marching cubes, with
+    slivers, and thin parts lost; mixed: one of these, drawn by the seed. Errors: MeshError for
+    fewer than 12 vertices, for another policy, for a mesh that PyMeshLab can't remesh to that
+    size, or without PyMeshLab.
     """
     if policy not in POLICIES:
         raise MeshError(f"policy must be one of {', '.join(POLICIES)}; got {policy!r}")
@@ -55,7 +56,7 @@ def remesh(mesh: Mesh, vertices: int, policy: str = "isotropic", seed: int = 0) 
     for _ in range(6):
         POLICIES[policy](tool, rng)
         count = tool.count
-        if count >= vertices or (policy == "marching" and count >= 0.95 * vertices):
+        if count >= (0.95 if policy == "marching" else 0.9 if tool.border() else 1) * vertices:
             break
         tool.edge *= 0.97 * np.sqrt(count / vertices)
     else:
@@ -63,7 +64,7 @@ def remesh(mesh: Mesh, vertices: int, policy: str = "isotropic", seed: int = 0) 
             f"{mesh.name}: could not be remeshed to {vertices} vertices, but to {count}"
         )
     if count > vertices:
-        tool.simplify(2 * vertices - 4)
+        tool.simplify()
     points, faces = tool.result()
     result = Mesh(points, faces, mesh.name).renumbered(rng.permutation(len(points)))
     return Remeshed(result, *closest_points(mesh, result.vertices, result.vertex_normals))
@@ -121,6 +122,30 @@ def closest_points(
     return face, weights / weights.sum(axis=1, keepdims=True), distance
 
 
+def bending(mesh: Mesh, radius: float) -> np.ndarray:
+    """How much the surface curves around each vertex, float64 [V] in 0..1: one less the length of
+    the mean of the normals within the radius, or two of the mesh's own edges if that is more.
+
+    On a sphere of radius R it is (radius / 2R)^2, nearly. Normals that face the other way are of
+    another sheet, and do not count.
+    """
+    radius = max(radius, 2 * mean_edge(mesh.area, len(mesh.vertices)))
+    normals = np.nan_to_num(mesh.vertex_normals)
+    one, other = cKDTree(mesh.vertices).query_pairs(radius, output_type="ndarray").T
+    agree = np.einsum("px,px->p", normals[one], normals[other]) > 0
+    one, other = one[agree], other[agree]
+    total, count = normals.copy(), np.ones(len(normals))
+    for vertex, near in ((one, other), (other, one)):
+        np.add.at(total, vertex, normals[near])
+        np.add.at(count, vertex, 1)
+    return 1 - np.linalg.norm(total, axis=1) / count
+
+
+def mean_edge(area: float, vertices: int) -> float:
+    """Of a mesh of equilateral triangles."""
+    return float(np.sqrt(2 / np.sqrt(3) * area / vertices))
+
+
 class Tool:
     """One mesh in PyMeshLab. Every parameter is given each time: it remembers those of other calls.
 
@@ -134,7 +159,7 @@ class Tool:
             raise MeshError("remeshing needs PyMeshLab: pip install -e '.[remesh]'") from error
         self._lab, self._source, self.vertices, self._rng = pymeshlab, mesh, vertices, rng
         self.area = mesh.area
-        self.edge = float(np.sqrt(2 / np.sqrt(3) * self.area / vertices))
+        self.edge = mean_edge(self.area, vertices)
         self.reset()
 
     def reset(self) -> None:
@@ -153,21 +178,45 @@ class Tool:
         mesh = self._set.current_mesh()
         return mesh.vertex_matrix(), mesh.face_matrix()
 
-    def isotropic(self, edge: float, times: int, adaptive=False, selected=False) -> None:
+    def border(self) -> int:
+        """The number of edges with one face."""
+        edges = trimesh.geometry.faces_to_edges(self._set.current_mesh().face_matrix())
+        return len(trimesh.grouping.group_rows(np.sort(edges, axis=1), require_count=1))
+
+    def isotropic(self, edge: float, times: int, selected=False) -> None:
         self._set.meshing_isotropic_explicit_remeshing(
-            iterations=times, adaptive=adaptive, selectedonly=selected,
+            iterations=times, adaptive=False, selectedonly=selected,
             targetlen=self._lab.PureValue(edge), featuredeg=180.0, checksurfdist=True,
             maxsurfdist=self._lab.PureValue(0.1 * self.edge), splitflag=True, collapseflag=True,
             swapflag=True, smoothflag=True, reprojectflag=True,
         )  # fmt: skip
 
-    def simplify(self, faces: int, selected=False, placement=False) -> None:
+    def simplify(self, selected=False, placement=False) -> None:
+        """To the number of vertices wanted; selected: there alone, if that suffices."""
+        mesh = self._set.current_mesh()
+        faces = mesh.selected_face_number() if selected else mesh.face_number()
+        fewer = 2 * (self.count - self.vertices)  # a collapsed edge has two faces, at a border one
+        fewer -= int(self.border() * (1 - np.sqrt(self.vertices / self.count)))
+        if not 0 < fewer < faces:
+            return
         self._set.meshing_decimation_quadric_edge_collapse(
-            targetfacenum=faces, targetperc=0.0, qualitythr=0.1, preserveboundary=False,
+            targetfacenum=faces - fewer, targetperc=0.0, qualitythr=0.1, preserveboundary=False,
             boundaryweight=1.0, preservenormal=True, preservetopology=True,
             optimalplacement=placement, planarquadric=False, planarweight=0.001,
             qualityweight=False, autoclean=True, selected=selected,
         )  # fmt: skip
+
+    def select_bent(self, share: float) -> None:
+        """The most curved faces, up to that share of the area."""
+        points, faces = self.result()
+        bent = bending(self._source, self.edge)[cKDTree(self._source.vertices).query(points)[1]]
+        order = np.argsort(-bent[faces].mean(axis=1))
+        area = np.cumsum(trimesh.triangles.area(points[faces[order]]))
+        last = order[np.searchsorted(area, share * area[-1])]
+        self._set = self._lab.MeshSet()
+        self._set.add_mesh(self._lab.Mesh(points, faces, v_scalar_array=bent))
+        least = bent[faces[last]].mean()
+        self._set.compute_selection_by_condition_per_face(condselect=f"(q0+q1+q2)/3 > {least}")
 
     def select_around(self, centres: np.ndarray, radius: float) -> None:
         near = " || ".join(
@@ -176,13 +225,9 @@ class Tool:
         )
         self._set.compute_selection_by_condition_per_face(condselect=near)
 
-    def invert_selection(self) -> int:
-        """The number of faces then selected."""
+    def simplify_the_rest(self) -> None:
         self._set.apply_selection_inverse(invfaces=True, invverts=False)
-        return self._set.current_mesh().selected_face_number()
-
-    def faces(self) -> int:
-        return self._set.current_mesh().face_number()
+        self.simplify(selected=True)
 
     def marching_cubes(self, cell: float) -> None:
         self.reset()
@@ -191,6 +236,8 @@ class Tool:
             mergeclosevert=False, discretize=False, multisample=False, absdist=False,
         )  # fmt: skip
         pieces = trimesh.Trimesh(*self.result(), process=False).split(only_watertight=False)
+        if not len(pieces):
+            raise MeshError(f"{self._source.name}: too thin for marching cubes of that size")
         largest = max(pieces, key=lambda piece: len(piece.vertices))
         self._set = self._lab.MeshSet()
         self._set.add_mesh(self._lab.Mesh(largest.vertices, largest.faces))
@@ -208,7 +255,12 @@ def _isotropic(tool: Tool, rng: np.random.Generator) -> None:
 
 def _adaptive(tool: Tool, rng: np.random.Generator) -> None:
     _finely(tool, rng)
-    tool.isotropic(0.9 * tool.edge, 8, adaptive=True)
+    tool.isotropic(1.35 * tool.edge, 8)
+    for share, length in ((0.35, 0.85), (0.12, 0.55)):
+        tool.select_bent(share)
+        tool.isotropic(length * tool.edge, 4, selected=True)
+    tool.select_bent(0.35)
+    tool.simplify_the_rest()
 
 
 def _refined(tool: Tool, rng: np.random.Generator) -> None:
@@ -220,17 +272,14 @@ def _refined(tool: Tool, rng: np.random.Generator) -> None:
     tool.select_around(centres, radius)
     tool.isotropic(0.5 * tool.edge, 4, selected=True)
     tool.select_around(centres, radius)
-    outside = tool.invert_selection()
-    too_many = tool.faces() - (2 * tool.vertices - 4)
-    if 0 < too_many < outside:  # what is refined stays so
-        tool.simplify(outside - too_many, selected=True)
+    tool.simplify_the_rest()  # what is refined stays so
 
 
 def _simplified(tool: Tool, rng: np.random.Generator) -> None:
     _finely(tool, rng)
     tool.isotropic(rng.uniform(0.8, 1.2) * tool.edge, 3)  # the old vertices go
     tool.isotropic(rng.uniform(0.35, 0.45) * tool.edge, 3)
-    tool.simplify(2 * tool.vertices - 4, placement=True)
+    tool.simplify(placement=True)
 
 
 def _marching(tool: Tool, rng: np.random.Generator) -> None:

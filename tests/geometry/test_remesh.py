@@ -7,10 +7,11 @@ import builtins
 import numpy as np
 import pytest
 import trimesh
+from scipy.spatial import cKDTree
 
 from src.config import ONE_OF
 from src.geometry.mesh import Mesh, MeshError
-from src.geometry.remesh import POLICIES, Tool, closest_points, remesh
+from src.geometry.remesh import POLICIES, Tool, bending, closest_points, remesh
 from tests.meshes import bumpy_sphere, lattice
 
 KINDS = [policy for policy in POLICIES if policy != "mixed"]
@@ -65,6 +66,43 @@ def test_policies_differ_as_they_say(surface):
     assert spread["refined"] > 1.5 * spread["isotropic"]
     assert angle["simplified"] < angle["isotropic"]
     assert slivers["marching"] < 0.5 * slivers["isotropic"]
+
+
+@pytest.mark.parametrize("vertices", [200, 600])
+def test_adaptive_edges_are_short_where_the_surface_is_curved(surface, vertices):
+    """Mean edge at the most curved quarter of the vertices, over that at the least curved."""
+
+    def ratio(policy):
+        mesh = remesh(surface, vertices, policy, seed=0).mesh
+        shape = solid(mesh)
+        ends = shape.edges_unique.ravel()
+        length = np.bincount(ends, shape.edges_unique_length.repeat(2)) / np.bincount(ends)
+        curved = bending(surface, 2 * length.mean())[
+            cKDTree(surface.vertices).query(mesh.vertices)[1]
+        ]
+        least, most = np.quantile(curved, [0.25, 0.75])
+        return length[curved >= most].mean() / length[curved <= least].mean()
+
+    assert ratio("adaptive") < 0.6 < 0.8 < ratio("isotropic")
+
+
+def test_bending_of_a_sphere_is_that_of_a_cap():
+    ball = trimesh.creation.icosphere(4, radius=2.0)
+    bent = bending(Mesh(ball.vertices, ball.faces), 0.6)
+    np.testing.assert_allclose(bent, 0.15**2, rtol=0.1)
+    assert bending(lattice(9, 9), 1.0).max() < 1e-12
+
+
+@pytest.mark.parametrize("policy", KINDS)
+def test_tori_and_open_surfaces_get_their_size(policy):
+    torus = trimesh.creation.torus(1, 0.4, major_sections=32, minor_sections=16)
+    made = remesh(Mesh(torus.vertices, torus.faces), 300, policy, seed=1).mesh
+    assert 285 <= len(made.vertices) <= 300 and solid(made).euler_number == 0
+    hills = lattice(15, 15)
+    heights = np.sin(hills.vertices[:, 0]) / 2
+    hills = Mesh(hills.vertices + heights[:, None] * [0, 0, 1], hills.faces)
+    made = remesh(hills, 100, policy, seed=1).mesh
+    assert 90 <= len(made.vertices) <= 100 and not solid(made).is_watertight
 
 
 def test_mixed_draws_one_of_the_others(surface, monkeypatch):
