@@ -70,11 +70,20 @@ def entry_point(
             try:
                 hydra.main(config_path=CONF, config_name=name, version_base="1.3")(job)()
             except Stopped as stopped:
-                print(f"\n{stopped}", file=sys.stderr)
+                again = " To go on: the same command" if Table.folder else ""
+                print(f"\n{stopped}{again * (str(stopped) == 'Stopped.')}", file=sys.stderr)
                 sys.exit(128 + stopped.signum)
             except USER_ERRORS as error:
                 print(f"error: {one_line(error)}", file=sys.stderr)
                 sys.exit(2 if isinstance(error, HydraException) else 1)
+            except Exception as error:  # of the launcher: a job that was killed, say
+                if Table.folder is None:
+                    raise
+                Table.show()
+                reason = f"{type(error).__name__}: {' '.join(str(error).split())}"
+                again = "to go on: the same command"
+                print(f"error: a job came to no end ({reason}); {again}", file=sys.stderr)
+                sys.exit(1)
             if failed or Table.failed:
                 sys.exit(1)
 

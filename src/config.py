@@ -55,8 +55,8 @@ class Shot:
 
 @dataclass
 class Remesh:
-    policy: str = MISSING
-    vertices: int = MISSING
+    policy: str = "isotropic"
+    vertices: int | None = None
     copies: int = 1
 
 
@@ -237,6 +237,8 @@ def _check_values(typed: DictConfig) -> None:
 
 
 def _check_ranges(typed: DictConfig) -> None:
+    if missing := sorted(OmegaConf.missing_keys(typed)):
+        raise ConfigError(f"{missing[0]} must be given")
     _check_values(typed)
     if typed.trainer.val_every > typed.optim.epochs:
         raise ConfigError(

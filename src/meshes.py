@@ -13,11 +13,12 @@ from tqdm import tqdm
 from src.cli import entry_point
 from src.config import ConfigError, checked_data, typed
 from src.data.shapes import SPLITS, DataError, Shape, ShapeSet
+from src.geometry.connectivity import fans
 from src.geometry.mesh import Mesh
 
 log = logging.getLogger("src.meshes")
-COLUMNS = ("vertices", "faces", "parts", "closed", "genus", "edges cv", "least angle", "shared",
-           "off source", "off label")  # fmt: skip
+COLUMNS = ("vertices", "faces", "parts", "manifold", "closed", "genus", "as source", "edges cv",
+           "least angle", "shared", "off source", "off label")  # fmt: skip
 
 
 @dataclass
@@ -48,7 +49,7 @@ def main(config: DictConfig) -> None:
     log.info("%s", HELP)
     width = max(map(len, names))
     log.info("%s", " ".join([" " * width, *(f"{column:>11}" for column in COLUMNS)]))
-    rows, before = [], shapes.load(names[-1])
+    rows, before = [], shapes.load(names[-1]) if len(names) > 1 else None
     for name in tqdm(names, desc="Meshes", leave=False, delay=1.0):
         shape = shapes.load(name)
         rows.append(row(shape, before, shapes, name))
@@ -61,10 +62,12 @@ def main(config: DictConfig) -> None:
 
 
 HELP = """\
-parts: connected components. closed: no boundary, every edge between two faces. edges cv: spread of
-the edges' lengths over their mean. least angle: of a face, in degrees, the median. shared: edges
-that join the same two vertices of the template as one of the mesh in the line above, in the first
-line as one of the last mesh. off source: the farthest that this mesh and the one it was made from
+parts: connected components. manifold: the faces at every vertex are one fan (at an edge there are
+never more than two). closed: no boundary, every edge between two faces. as source: parts, closed
+and genus are those of the mesh that it was made from. edges cv: spread of the edges' lengths over
+their mean. least angle: of a face, in degrees, the median. shared: edges that join the same two
+vertices of the template as one of the mesh in the line above, in the first line as one of the last
+mesh. off source: the farthest that this mesh and the one it was made from
 are apart, either way, over the mean edge. off label: the mean distance from the true point to its
 label, over the mean edge.
 """
@@ -78,28 +81,39 @@ def shown(value: float | int | bool | None) -> str:
     return f"{('yes' if value else 'no') if isinstance(value, bool) else value:>11}"
 
 
-def row(shape: Shape, before: Shape, shapes: ShapeSet, name: str) -> list[Any]:
-    """The values of COLUMNS."""
-    import trimesh
-
+def row(shape: Shape, before: Shape | None, shapes: ShapeSet, name: str) -> list[Any]:
+    """The values of COLUMNS; shared is None without a mesh to compare with."""
     from src.data.remeshed import Remeshed
 
-    mesh = shape.mesh
-    solid = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
-    lengths, parts = solid.edges_unique_length, int(solid.body_count)
-    off_source = off_label = None
+    mesh, solid = shape.mesh, solid_of(shape.mesh)
+    lengths = solid.edges_unique_length
+    as_source = off_source = off_label = None
     if isinstance(shapes, Remeshed):
-        off_source = apart(mesh, shapes.source(name).mesh) / lengths.mean()
+        source = shapes.source(name).mesh
+        as_source = topology(solid) == topology(solid_of(source))
+        off_source = apart(mesh, source) / lengths.mean()
     if shape.points is not None:
         place = shapes.template.vertices
         point = np.einsum("vk,vkx->vx", shape.points.weights, place[shape.points.corners])
         off_label = np.linalg.norm(point - place[shape.labels], axis=1).mean() / lengths.mean()
-    closed = bool(solid.is_watertight)
-    genus = int(parts - solid.euler_number // 2) if closed else None
-    return [len(mesh.vertices), len(mesh.faces), parts, closed, genus,
+    parts, closed, genus = topology(solid)
+    manifold = bool((fans(mesh) <= 1).all())
+    return [len(mesh.vertices), len(mesh.faces), parts, manifold, closed, genus, as_source,
             float(lengths.std() / lengths.mean()),
             float(np.median(np.degrees(solid.face_angles.min(axis=1)))),
-            shared(shape, before), off_source, off_label]  # fmt: skip
+            shared(shape, before) if before else None, off_source, off_label]  # fmt: skip
+
+
+def solid_of(mesh: Mesh):
+    import trimesh
+
+    return trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
+
+
+def topology(solid) -> tuple[int, bool, int | None]:
+    """The number of parts, whether they are closed, and if so their genus in all."""
+    parts, closed = int(solid.body_count), bool(solid.is_watertight)
+    return parts, closed, int(parts - solid.euler_number // 2) if closed else None
 
 
 def apart(one: Mesh, two: Mesh) -> float:

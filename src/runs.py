@@ -104,7 +104,7 @@ def in_use(folder: Path) -> bool:
 def differences(config: DictConfig, stored: DictConfig) -> list[str]:
     """The keys in which two configs would make two different runs."""
     one, two = (flat(OmegaConf.to_container(c, resolve=True)) for c in (config, stored))
-    keys = [key for key in one.keys() | two.keys() if key != "resume" and not _may_change(key)]
+    keys = [key for key in one.keys() | two.keys() if key != "resume" and not may_change(key)]
     return sorted(key for key in keys if one.get(key) != two.get(key))
 
 
@@ -135,7 +135,7 @@ def continued(config: DictConfig, overrides: list[str]) -> DictConfig:
                 f"{override} contradicts the run in {folder}; leave it out to go on with the run, "
                 f"or leave out resume= to start another. Free to change: {', '.join(MAY_CHANGE)}"
             )
-        if _may_change(key):
+        if may_change(key):
             OmegaConf.update(stored, key, _plain(config, key))
     stored.resume = None
     return stored
@@ -182,7 +182,9 @@ def _load(folder: Path) -> DictConfig:
         raise RunError(f"{folder / CONFIG} is no config of a run ({reason})") from error
 
 
-def _may_change(key: str) -> bool:
+def may_change(override: str) -> bool:
+    """Whether a key, or a key=value of the command line, may differ when a run is continued."""
+    key = override.lstrip("+~").split("=")[0]
     return any(key == free or key.startswith(free + ".") for free in MAY_CHANGE)
 
 

@@ -28,7 +28,7 @@ def announce() -> None:
     """Have the jobs of this command line, in whatever process they run, know its words."""
     os.environ[COMMAND] = json.dumps(sys.argv[1:])
     _fresh.cache_clear()
-    Table.failed = 0
+    Table.folder, Table.failed = None, 0
 
 
 def run_folder(resume: str | None, new: str) -> str:
@@ -74,11 +74,12 @@ def job_folder(overrides: list[str], number: int) -> str:
                 fixed.add(override.key_or_group)
     varied = [o.lstrip("+") for o in overrides if parse(o).key_or_group not in fixed]
     varied = [re.sub("=(True|False)$", lambda x: x[0].lower(), o) for o in varied]  # of a file
-    return legal_name("_".join(varied).replace("=", "-")) or str(number)
+    what = varied or [o.lstrip("+") for o in overrides]  # a sweep of one
+    return legal_name("_".join(what).replace("=", "-")) or str(number)
 
 
 def legal_name(name: str) -> str:
-    legal = re.sub(r"[^\w.+-]+", "-", name)[:120]
+    legal = re.sub(r"[^\w.+-]+", "-", name).encode()[:120].decode(errors="ignore")
     if legal != name:  # what was lost may be what tells two of them apart
         legal += "-" + hashlib.sha256(name.encode()).hexdigest()[:8]
     return legal
@@ -97,14 +98,16 @@ def states(folder: Path) -> list[tuple[str, str, str]]:
     """For each job of a sweep its folder, its state and its figures, or why it has none."""
     found = []
     for job in sorted(path for path in folder.iterdir() if path.is_dir()):
-        if (job / FAILED).is_file():
-            found.append((job.name, "failed", (job / FAILED).read_text().strip()))
-        elif (job / METRICS).is_file():
+        reason = (job / FAILED).read_text().strip() if (job / FAILED).is_file() else None
+        if (job / METRICS).is_file():
             metrics = json.loads((job / METRICS).read_text())
             exact, error = metrics["test/exact_match"], metrics["test/geodesic_error"]
-            found.append((job.name, "finished", f"{100 * exact:.2f} % exact, error {error:.4f}"))
+            what = f"{100 * exact:.2f} % exact, error {error:.4f}"
+            found.append((job.name, "finished", f"{what}; but {reason}" if reason else what))
         elif (job / CONFIG).is_file() and in_use(job):
             found.append((job.name, "running", "elsewhere"))
+        elif reason:
+            found.append((job.name, "failed", reason))
         elif (job / CONFIG).is_file():
             how = "goes on with the same command" if (job / LAST).is_file() else "no epoch yet"
             found.append((job.name, "stopped", how))
@@ -114,15 +117,26 @@ def states(folder: Path) -> list[tuple[str, str, str]]:
 class Table(Callback):
     """At the end of a sweep, by Hydra's leave: what finished, what failed, and why.
 
-    failed: how many did, in the latest sweep of this process.
+    folder: of the latest sweep of this process. failed: how many of its jobs did.
     """
 
+    folder: Path | None = None
     failed = 0
 
-    def on_multirun_end(self, config: DictConfig, **_: Any) -> None:
-        folder = Path(config.hydra.sweep.dir)
+    def on_multirun_start(self, config: DictConfig, **_: Any) -> None:
+        Table.folder = Path(config.hydra.sweep.dir)
+
+    def on_multirun_end(self, **_: Any) -> None:
+        Table.show()
+
+    @staticmethod
+    def show() -> None:
+        """Print it, as far as there is one."""
+        folder = Table.folder
+        if folder is None or not folder.is_dir():
+            return
         rows = states(folder)
-        Table.failed = sum(state == "failed" for _, state, _ in rows)
+        Table.failed = len(list(folder.glob(f"*/{FAILED}")))
         widths = [max([len(row[i]) for row in rows] or [0]) for i in range(2)]
         lines = [f"  {job:<{widths[0]}}  {state:<{widths[1]}}  {what}" for job, state, what in rows]
         print("\n".join([f"\nSweep {folder}:", *lines]))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import logging
+import os
 import shlex
 import subprocess
 import sys
@@ -24,7 +25,9 @@ from src.runs import (
     alone,
     claim,
     continued,
+    in_use,
     is_first,
+    may_change,
     read_checkpoint,
     write_metrics,
 )
@@ -56,7 +59,7 @@ def main(config: DictConfig) -> None:
             if not apart:
                 train(config, folder)
         if apart:
-            train_apart(folder)
+            train_apart(folder, [o for o in hydra.overrides.task if may_change(o)])
     except InUse:
         if not in_sweep:
             raise
@@ -69,20 +72,26 @@ def main(config: DictConfig) -> None:
         raise Stopped(stopped.signum, f"Stopped. To go on: {how}") from None
 
 
-def train_apart(folder: Path) -> None:
+def train_apart(folder: Path, overrides: list[str]) -> None:
     """A run of a sweep that takes several processes: Lightning starts the others with the command
-    line of this one, so it has to be one that runs nothing else. Errors: RunError."""
-    process = subprocess.Popen(
-        [sys.executable, "-m", "src.train", f"resume='{folder}'"], start_new_session=True
-    )
+    line of this one, so it has to be one that runs nothing else.
+
+    overrides: what this command line says of how and where it is computed. Errors: RunError; InUse.
+    """
+    command = [sys.executable, "-m", "src.train", f"resume='{folder}'", *overrides]
+    # of a cluster's job it would take the size, but it starts its processes itself
+    environment = {k: v for k, v in os.environ.items() if not k.startswith("SLURM_")}
+    process = subprocess.Popen(command, env=environment, start_new_session=True)
     try:
         code = process.wait()
     except Stopped as stopped:
         process.send_signal(stopped.signum)  # and to it alone, once
         process.wait()
         raise
+    if code and in_use(folder):
+        raise InUse(f"another process is training in {folder}")
     if code:
-        raise RunError(f"the run in {folder} ended with exit code {code}; what it said is above")
+        raise RunError(f"its processes ended with exit code {code}; why is in {folder}/train*.log")
 
 
 def train(config: DictConfig, folder: Path) -> dict[str, float]:
@@ -132,9 +141,9 @@ def train(config: DictConfig, folder: Path) -> dict[str, float]:
         outcome = Outcome.of(data.shapes.names["test"], data.datasets["test"].items,
                              module.results["test"], data.reference.diameter)  # fmt: skip
         outcome.save(folder / ERRORS)
-        write_metrics(folder, metrics)
         chosen = evenly(outcome.names, 4) if config.picture else []
         summary.draw(folder, module.curves, outcome, data, chosen)
+        write_metrics(folder, metrics)  # with it, a run is finished
         for line in summary.table(outcome, metrics):
             log.info(line)
         log.info("Seconds:     %.1f preprocessing, %.1f training", seconds, speed.seconds)
@@ -161,6 +170,8 @@ def check(checkpoint: Path, config: dict, processes: int) -> None:
 
 def describe(config: DictConfig, data, parameters: int, precision: str, seconds: float):
     """What is about to be trained, on what, and where its input is kept."""
+    import torch
+
     sizes = [len(data.shapes.names[split]) for split in ("train", "val", "test")]
     made = f", remeshed ({config.data.remesh.policy})" if config.data.remesh else ""
     yield (
@@ -169,7 +180,8 @@ def describe(config: DictConfig, data, parameters: int, precision: str, seconds:
     )
     yield (
         f"{config.model.name}: {parameters:,} parameters, {neighbourhoods(config)}; "
-        f"{config.optim.epochs} epochs, {precision} on {config.trainer.accelerator}"
+        f"{config.optim.epochs} epochs, {precision} on {config.trainer.accelerator}, "
+        f"{torch.get_num_threads()} thread{'s' * (torch.get_num_threads() > 1)}"
     )
     megabytes = data.store.size() / 1e6
     yield f"cache: {data.store.root}, {megabytes:.0f} MB; ready after {seconds:.1f} s"

@@ -228,7 +228,8 @@ def test_jobs_never_share_a_folder(monkeypatch):
     assert len(set(names)) == len(values)
     assert names[-2:] == ["data.root-1", "data.root-2"]
     assert all(re.fullmatch(r"[\w.+-]{1,130}", name) for name in names)
-    assert job_folder(["seq_len=8"], 3) == "3"
+    assert job_folder(["seq_len=8"], 3) == "seq_len-8"  # a sweep of one
+    assert job_folder([], 3) == "3"
 
 
 def test_a_folder_with_another_run_is_left_alone(cli, toy_overrides, tmp_path):

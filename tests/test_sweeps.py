@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -17,10 +18,22 @@ import torch
 from omegaconf import OmegaConf
 
 from src.callbacks import OrderlyStop
-from src.runs import BEST, CONFIG, LAST, METRICS, RunError, Stopped, alone, write_metrics
+from src.runs import (
+    BEST,
+    CONFIG,
+    LAST,
+    METRICS,
+    InUse,
+    RunError,
+    Stopped,
+    alone,
+    claim,
+    write_metrics,
+)  # fmt: skip
 from src.sweeps import FAILED, announce, legal_name, run_folder, states, sweep_folder
+from src.train import train_apart
 from tests.test_cli import QUICK, cli  # noqa: F401
-from tests.test_train import FIGURES, ROOT, program_process, run, wait_for, weights
+from tests.test_train import FIGURES, ROOT, composed, program_process, run, wait_for, weights
 
 SWEEP = ["-m", "seed=0,1,2", "optim.epochs=12"]
 
@@ -113,10 +126,10 @@ def test_one_command_one_folder(monkeypatch):
     assert folder("-m") == "sweep"
 
 
-@pytest.mark.parametrize("name", ["a/b", "a=b", "ü,*?", "x" * 500])
+@pytest.mark.parametrize("name", ["a/b", "a=b", "ü,*?", "x" * 500, "体" * 200])
 def test_names_are_legal_and_their_own(name):
     legal = legal_name(name)
-    assert len(legal) < 140 and not set(legal) & set("/=,*?\\ ")
+    assert len(legal.encode()) < 140 and not set(legal) & set("/=,*?\\ ")
     assert legal != legal_name(name + "1")
 
 
@@ -125,10 +138,14 @@ def test_jobs_run_in_processes_of_their_own(toy_overrides, tmp_path, launcher):
     """Several at a time, with one cache, each on its share of the cores; one fails."""
     toy = [o for o in toy_overrides if not o.startswith(("trainer.threads", "optim"))]
     command = ["-m", f"hydra/launcher={launcher}", "optim.lr=0,0.01", *toy, *QUICK]
-    env = {**os.environ, "PYTHONPATH": str(ROOT)}
-    done = subprocess.run([sys.executable, "-m", "src.train", *command], cwd=tmp_path, env=env,
-                          capture_output=True, text=True)  # fmt: skip
+    env = {k: v for k, v in os.environ.items() if not k.endswith("_NUM_THREADS")}
+    done = subprocess.run([sys.executable, "-m", "src.train", *command], cwd=tmp_path,
+                          env={**env, "PYTHONPATH": str(ROOT)}, capture_output=True,
+                          text=True)  # fmt: skip
     assert done.returncode == 1, done.stderr
+    if launcher == "joblib":  # as many jobs as cores at once
+        [log] = (tmp_path / "outputs" / "sweeps").glob("*/optim.lr-0.01/train.log")
+        assert "32-true on cpu, 1 thread\n" in log.read_text()
     [sweep] = (tmp_path / "outputs" / "sweeps").iterdir()
     assert "launcher" not in sweep.name
     found = {job: state for job, state, _ in states(sweep)}
@@ -146,12 +163,17 @@ def test_jobs_run_in_processes_of_their_own(toy_overrides, tmp_path, launcher):
 
 def test_two_processes_measure_what_one_does(toy_overrides, tmp_path):
     """Three meshes on two processes: every mesh counts once. As a job of a sweep, of which the
-    second process must know nothing."""
+    second process must know nothing; and which a cluster runs as one task, having begun as a run in
+    one process."""
     ddp = ["trainer=ddp", "trainer.accelerator=cpu", "trainer.devices=2"]
+    (tmp_path / "job").mkdir()
+    claim(tmp_path / "job", composed([*toy_overrides, "optim.epochs=2"]))
+    slurm = {"SLURM_JOB_ID": "7", "SLURM_JOB_NAME": "job", "SLURM_NTASKS": "1",
+             "SLURM_NTASKS_PER_NODE": "1", "SLURM_PROCID": "0", "SLURM_LOCALID": "0"}  # fmt: skip
     done = subprocess.run(
         [sys.executable, "-m", "src.train", "-m", *toy_overrides, *ddp, "optim.epochs=2",
          f"hydra.sweep.dir={tmp_path}", "hydra.sweep.subdir=job"],
-        cwd=ROOT, capture_output=True, text=True, check=False,
+        cwd=ROOT, env={**os.environ, **slurm}, capture_output=True, text=True, check=False,
     )  # fmt: skip
     assert done.returncode == 0, done.stdout + done.stderr
     assert done.stdout.count("Test on 3 unseen meshes") == 1
@@ -211,24 +233,112 @@ def test_a_job_at_which_another_process_is_is_left_to_it(cli, toy_overrides, tmp
     assert [state for _, state, _ in states(sweep)] == 2 * ["finished"]
 
 
+def test_a_job_of_several_processes_at_which_others_are_has_not_failed(tmp_path, monkeypatch):
+    monkeypatch.setattr(sys, "executable", "false")  # what it runs ends with 1
+    with alone(tmp_path), pytest.raises(InUse):
+        train_apart(tmp_path, [])
+    with pytest.raises(RunError, match=r"ended with exit code 1; why is in .*train\*.log"):
+        train_apart(tmp_path, [])
+
+
+def test_a_run_with_other_settings_fails_but_what_is_finished_stays_so(cli, toy_overrides):  # noqa: F811
+    command = ["-m", "seed=0,1", *toy_overrides, "hydra.sweep.dir=sweep"]
+    assert cli(*command, *QUICK)[0] == 0
+    code, _, _ = cli(*command, "optim.epochs=2")
+    assert code == 1
+    rows = states(Path("sweep"))
+    assert [state for _, state, _ in rows] == 2 * ["finished"]
+    assert "but sweep/seed-0 holds another run (optim.epochs differ)" in rows[0][2]
+    assert cli(*command, *QUICK)[0] == 0
+    assert "holds another run" not in states(Path("sweep"))[0][2]
+
+
+@pytest.fixture
+def two_at_a_time(toy_overrides, tmp_path):
+    """A sweep in two processes, each past its first epoch."""
+    toy = [o for o in toy_overrides if not o.startswith("optim")]
+    process = subprocess.Popen(
+        [sys.executable, "-m", "src.train", "-m", "hydra/launcher=joblib", "seed=0,1", *toy,
+         "optim.epochs=5000"],
+        cwd=tmp_path, env={**os.environ, "PYTHONPATH": str(ROOT)}, stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE, text=True,
+    )  # fmt: skip
+    wait_for(lambda: len(list(tmp_path.glob(f"outputs/sweeps/*/*/{LAST}"))) == 2, process)
+    yield process
+    process.kill()
+
+
+@pytest.mark.skipif(not Path("/proc/self/task").is_dir(), reason="/proc names the workers")
+def test_a_worker_that_is_killed_leaves_the_table_and_a_line(two_at_a_time):
+    own = Path(f"/proc/{two_at_a_time.pid}/task/{two_at_a_time.pid}/children")
+    children = [Path("/proc", pid) for pid in own.read_text().split()]
+    worker = next(c for c in children if "popen_loky" in (c / "cmdline").read_text())
+    os.kill(int(worker.name), signal.SIGKILL)
+    out, err = two_at_a_time.communicate(timeout=60)
+    assert two_at_a_time.returncode == 1
+    assert out.count("goes on with the same command") == 2 and "Traceback" not in err
+    line = (
+        r"error: a job came to no end \(TerminatedWorkerError: .*\); to go on: the same command\n"
+    )
+    assert re.search(line, err)
+
+
+def test_ctrl_c_in_a_launcher_says_how_to_go_on(two_at_a_time):
+    two_at_a_time.send_signal(signal.SIGINT)
+    _, err = two_at_a_time.communicate(timeout=60)
+    assert two_at_a_time.returncode == 130
+    assert "Stopped. To go on: the same command" in err
+
+
+def test_a_run_whose_pictures_failed_is_not_finished(cli, toy_overrides, monkeypatch):  # noqa: F811
+    def full(*_):
+        raise OSError(28, "No space left on device", "curve.png")
+
+    command = ["-m", "seed=0", *toy_overrides, *QUICK]
+    with monkeypatch.context() as broken:
+        broken.setattr("src.summary.draw", full)
+        assert cli(*command)[0] == 1
+    [sweep] = Path("outputs/sweeps").iterdir()
+    [row] = states(sweep)
+    assert row[1:] == ("failed", "curve.png: No space left on device")
+    assert cli(*command)[0] == 0
+    [row] = states(sweep)
+    assert row[1] == "finished" and (sweep / row[0] / "curve.png").is_file()
+
+
+@pytest.mark.parametrize("launcher", ["joblib", "slurm", "submitit_local"])
+def test_the_launchers_have_configs(cli, launcher):  # noqa: F811
+    code, out, err = cli(f"hydra/launcher={launcher}", "--cfg", "hydra", "-p", "hydra.launcher")
+    assert code == 0, err
+    assert "_target_: hydra_plugins." in out
+    assert ("max_num_timeout: 6" in out) == (launcher == "slurm")
+
+
 @pytest.mark.parametrize(
     "name, jobs",
     [
         ("networks", {"model-fcs", "model-gcnn3", "model-lstm"}),
-        ("remeshed", {f"model-{m}_metric-{x}" for m in ("fcs", "lstm") for x in ("true", "false")}),
+        ("rotations", {"model-fcs", "model-lstm"}),
+        ("remeshed", {f"model-{m}_data.remesh.policy-{p}_metric-{x}" for m in ("fcs", "lstm")
+                      for p in ("isotropic", "mixed") for x in ("true", "false")}),
         ("lengths", {f"model-{m}_seq_len-{n}_metric-{x}" for m in ("fcs", "lstm")
                      for n in (15, 20, 30) for x in ("true", "false")}),
     ],
-    ids=["networks", "remeshed", "lengths"],
+    ids=["networks", "rotations", "remeshed", "lengths"],
 )  # fmt: skip
-def test_the_paper_s_experiments_are_sweeps(cli, toy_overrides, monkeypatch, name, jobs):  # noqa: F811
-    """Which jobs they are; what a job does has tests of its own."""
+@pytest.mark.parametrize("paper", [False, True])
+def test_the_paper_s_experiments_are_sweeps(cli, toy_overrides, monkeypatch, name, jobs, paper):  # noqa: F811
+    """Which jobs they are, with our settings or the paper's; what they do has its own tests."""
     figures = {"test/exact_match": 0.0, "test/geodesic_error": 0.0}
     monkeypatch.setattr("src.train.train", lambda config, folder: write_metrics(folder, figures))
-    toy = [o for o in toy_overrides if not o.startswith("seq_len")]
-    code, _, err = cli("-m", f"experiment={name}", *toy, *QUICK)
+    toy = [o for o in toy_overrides if not o.startswith(("seq_len", "data.shot"))]
+    code, _, err = cli("-m", f"experiment={f'[paper,{name}]' if paper else name}", *toy, *QUICK)
     assert code == 0, err
     [sweep] = Path("outputs/sweeps").iterdir()
     assert {(job, state) for job, state, _ in states(sweep)} == {(job, "finished") for job in jobs}
-    lengths = {OmegaConf.load(sweep / job / CONFIG).seq_len for job in jobs}
-    assert lengths == ({15, 20, 30} if name == "lengths" else {30})
+    configs = [OmegaConf.load(sweep / job / CONFIG) for job in jobs]
+    assert {c.seq_len for c in configs} == ({15, 20, 30} if name == "lengths" else {30})
+    assert {c.optim.lr for c in configs} == {0.001 if paper else 0.004}
+    assert {c.model.dropout for c in configs} == {0.3}
+    remeshed = {(c.data.remesh.policy, c.data.remesh.vertices) for c in configs if c.data.remesh}
+    assert remeshed == ({("isotropic", None), ("mixed", None)} if name == "remeshed" else set())

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import random
 import sys
 import time
 from collections.abc import Callable, Iterable
@@ -143,13 +145,15 @@ def by_rows_and_columns(arrays: Arrays, vertices: int) -> Arrays:
 
 
 def run_tasks(tasks: Iterable[Task], store: Store, workers: int | None, description: str) -> None:
-    """Compute and keep what the store lacks, with a progress bar.
+    """Compute and keep what the store lacks, with a progress bar, in an order of this process's
+    own: the jobs of a sweep that begin together share the work.
 
     workers: processes; None for one per core. Other processes are started only when what remains
     would keep this one busy for longer than their start takes.
     """
     missing = {task.key: task for task in tasks if not store.has(task.kind, task.key)}
     queue = list(missing.values())
+    random.Random(os.getpid()).shuffle(queue)
     workers = min(workers or cpu_count(), len(queue))
     progress = tqdm(total=len(queue), desc=description, delay=1.0)
     with progress:
@@ -166,7 +170,8 @@ def run_tasks(tasks: Iterable[Task], store: Store, workers: int | None, descript
 
 
 def _run(task: Task, store: Store) -> None:
-    store.save(task.kind, task.key, task.compute(*task.arguments))
+    if not store.has(task.kind, task.key):  # another process may have been here
+        store.save(task.kind, task.key, task.compute(*task.arguments))
 
 
 def _run_in_pool(tasks: list[Task], store: Store, workers: int, progress: tqdm) -> None:

@@ -19,9 +19,9 @@ class Remeshed(ShapeSet):
 
     Its template, names and split are those of the other set. The truth of a vertex is a point of
     the template: the one that its closest point on the original shape stands for; its label is the
-    nearest corner of that face. policy, vertices: as `src.geometry.remesh.remesh` takes them; the
-    seed is drawn from the shape's content. copies: so many tessellations of each training shape.
-    Errors: DataError without PyMeshLab.
+    nearest corner of that face. policy, vertices: as `src.geometry.remesh.remesh` takes them; None
+    for `usual_size`. The seed is drawn from the shape's content. copies: so many tessellations of
+    each training shape. Errors: DataError without PyMeshLab.
     """
 
     def __init__(
@@ -30,7 +30,7 @@ class Remeshed(ShapeSet):
         store: Store,
         workers: int | None,
         policy: str,
-        vertices: int,
+        vertices: int | None,
         copies: int = 1,
     ) -> None:
         try:
@@ -38,7 +38,8 @@ class Remeshed(ShapeSet):
         except PackageNotFoundError as error:
             raise DataError("remeshing needs PyMeshLab: pip install -e '.[remesh]'") from error
         self._base, self._store, self._workers = base, store, workers
-        self._policy, self._vertices = policy, vertices
+        self._policy = policy
+        self._vertices = vertices or usual_size(len(base.template.vertices))
         self.template, self.up = base.template, base.up
         once, further = base.names["train"], range(2, copies + 1)
         self._copies = {f"{name}~{copy}": (name, copy) for copy in further for name in once}
@@ -75,6 +76,13 @@ class Remeshed(ShapeSet):
         key = digest(*what, self._vertices, code, self._version)
         seed = int(digest(*what)[:15], 16)
         return Task("meshes", key, _remesh, (source, self._vertices, self._policy, seed))
+
+
+def usual_size(vertices: int) -> int:
+    """The vertices of a remeshed shape for so many of the template: 5000 for FAUST's 6890 and in
+    proportion for others, to the hundred if there are that many."""
+    size = vertices * 5000 / 6890
+    return round(size, -2) if size > 1000 else max(12, round(size))
 
 
 def _remesh(source: Mesh, vertices: int, policy: str, seed: int) -> Arrays:

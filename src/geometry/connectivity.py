@@ -23,8 +23,7 @@ def one_rings(mesh: Mesh) -> tuple[np.ndarray, np.ndarray]:
     distance of their first neighbour. Nothing depends on the numbering of vertices or faces.
     """
     neighbours, first, begins = _one_rings(mesh.faces, len(mesh.vertices))
-    fans = np.diff(np.concatenate([[0], np.cumsum(begins > 0)])[first])
-    for v in np.flatnonzero(fans > 1):
+    for v in np.flatnonzero(_fans(first, begins) > 1):
         here = slice(first[v], first[v + 1])
         ring, begin = neighbours[here], begins[here]
         distance = ((mesh.vertices[ring] - mesh.vertices[v]) ** 2).sum(axis=1)
@@ -34,6 +33,17 @@ def one_rings(mesh: Mesh) -> tuple[np.ndarray, np.ndarray]:
         parts.sort(key=lambda part: distance[part[0]])
         neighbours[here] = ring[np.concatenate(parts)]
     return neighbours, first
+
+
+def fans(mesh: Mesh) -> np.ndarray:
+    """The number of fans that the faces at every vertex make, int64 [V]: 1 where the surface is
+    manifold, more at a bow tie, 0 without a face."""
+    _, first, begins = _one_rings(mesh.faces, len(mesh.vertices))
+    return _fans(first, begins)
+
+
+def _fans(first: np.ndarray, begins: np.ndarray) -> np.ndarray:
+    return np.diff(np.concatenate([[0], np.cumsum(begins > 0)])[first])
 
 
 @njit(cache=True)

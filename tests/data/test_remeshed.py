@@ -7,15 +7,16 @@ import json
 import numpy as np
 import pytest
 
-from src.data.remeshed import Remeshed
+from src.data.remeshed import Remeshed, usual_size
 from src.data.shapes import DataError, ShapeSet, registered_shape
 from src.data.sources import open_shapes
 from src.data.store import Store
 from src.evaluation import ERRORS, Outcome
 from src.geometry import remesh as module
-from src.meshes import edges, main, shared
+from src.meshes import COLUMNS, edges, main, row, shared
 from src.runs import METRICS
 from tests.conftest import toy_shapes
+from tests.meshes import bow_tie, punctured
 from tests.test_cli import cli  # noqa: F401
 from tests.test_train import FIGURES, run
 
@@ -88,6 +89,23 @@ def test_no_two_shapes_have_their_edges_in_common(tmp_path):
     assert len(edges(registered[0])) == len(registered[0].mesh.faces) * 3 // 2
 
 
+def test_the_table_sees_a_bow_tie_and_what_was_torn(toys):
+    def columns(mesh):
+        shape = registered_shape(mesh, mesh)
+        return dict(zip(COLUMNS, row(shape, None, toys, "val/0.ply"), strict=True))
+
+    assert not columns(bow_tie())["manifold"]
+    whole = toys.source("val/0.ply").mesh
+    assert columns(whole)["manifold"] and columns(whole)["as source"]
+    torn = columns(punctured(whole, 0.05))
+    assert not torn["closed"] and not torn["as source"]
+
+
+@pytest.mark.parametrize("template, size", [(6890, 5000), (1500, 1100), (162, 118), (10, 12)])
+def test_the_usual_size(template, size):
+    assert usual_size(template) == size
+
+
 def test_another_policy_or_size_is_another_mesh(toys, tmp_path):
     one = toys.load("val/0.ply").mesh
     for policy, size in (("isotropic", 110), ("adaptive", 120)):
@@ -127,11 +145,13 @@ def test_the_meshes_of_a_data_set_in_a_table(cli, toy_overrides):  # noqa: F811
     lines = [line.split() for line in out.splitlines() if line.startswith(("test_", "mean"))]
     assert [line[0] for line in lines] == ["test_0", "test_1", "test_2", "mean"]
     for line in lines[:-1]:
-        assert 114 <= int(line[1]) <= 120 and line[4] == "yes" and line[5] == "0"
-    assert float(lines[-1][8]) < 0.8  # shared edges
+        assert 114 <= int(line[1]) <= 120 and line[4:8] == ["yes", "yes", "0", "yes"]
+    assert float(lines[-1][10]) < 0.8  # shared edges
     code, out, err = cli(*data, "split=test", program=main)  # as registered
     lines = [line.split() for line in out.splitlines() if line.startswith("test_")]
-    assert code == 0 and all(line[8:] == ["1.00", "-", "-"] for line in lines)
+    assert code == 0 and all(line[7] == "-" and line[10:] == ["1.00", "-", "-"] for line in lines)
+    code, out, err = cli(*data, *REMESH, "data.val=[val/0.ply]", "split=val", program=main)
+    assert code == 0 and out.splitlines()[-2].split()[10] == "-"  # one mesh, nothing to compare
     code, out, err = cli(*data, "data.val=[]", "split=val", program=main)
     assert code == 1 and "has no mesh in its split val" in out + err
 

@@ -9,7 +9,14 @@ import zipfile
 import numpy as np
 import pytest
 
-from src.data.preprocessing import PatchRecipe, Recipe, descriptor_task, patch_task, run_tasks
+from src.data.preprocessing import (
+    PatchRecipe,
+    Recipe,
+    Task,
+    descriptor_task,
+    patch_task,
+    run_tasks,
+)  # fmt: skip
 from src.data.store import Store, StoreError, code_version, digest
 from tests.meshes import bumpy_sphere
 
@@ -224,3 +231,16 @@ def test_the_code_version_depends_on_the_source(tmp_path, monkeypatch):
         (tmp_path / f"module_{i}.py").write_text(f"x = {i}\n")
         versions.append(code_version(importlib.import_module(f"module_{i}")))
     assert versions[0] != versions[1]
+
+
+def test_what_another_process_has_done_meanwhile_is_not_done_again(tmp_path):
+    store, done = Store(tmp_path), []
+
+    def compute(key):
+        for each in "abc":  # the others do theirs, and all the rest
+            store.save("toys", each, {"x": np.zeros(1)})
+        done.append(key)
+        return {"x": np.zeros(1)}
+
+    run_tasks([Task("toys", key, compute, (key,)) for key in "abc"], store, 1, "Preparing")
+    assert len(done) == 1
