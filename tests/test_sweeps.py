@@ -319,12 +319,14 @@ def test_the_launchers_have_configs(cli, launcher):  # noqa: F811
     [
         ("networks", {"model-fcs", "model-gcnn3", "model-lstm"}),
         ("rotations", {"model-fcs", "model-lstm"}),
+        ("remeshed model=gcnn3 metric=false",
+         {"data.remesh.policy-isotropic", "data.remesh.policy-mixed"}),
         ("remeshed", {f"model-{m}_data.remesh.policy-{p}_metric-{x}" for m in ("fcs", "lstm")
                       for p in ("isotropic", "mixed") for x in ("true", "false")}),
         ("lengths", {f"model-{m}_seq_len-{n}_metric-{x}" for m in ("fcs", "lstm")
                      for n in (15, 20, 30) for x in ("true", "false")}),
     ],
-    ids=["networks", "rotations", "remeshed", "lengths"],
+    ids=["networks", "rotations", "remeshed_gcnn3", "remeshed", "lengths"],
 )  # fmt: skip
 @pytest.mark.parametrize("paper", [False, True])
 def test_the_paper_s_experiments_are_sweeps(cli, toy_overrides, monkeypatch, name, jobs, paper):  # noqa: F811
@@ -332,7 +334,9 @@ def test_the_paper_s_experiments_are_sweeps(cli, toy_overrides, monkeypatch, nam
     figures = {"test/exact_match": 0.0, "test/geodesic_error": 0.0}
     monkeypatch.setattr("src.train.train", lambda config, folder: write_metrics(folder, figures))
     toy = [o for o in toy_overrides if not o.startswith(("seq_len", "data.shot"))]
-    code, _, err = cli("-m", f"experiment={f'[paper,{name}]' if paper else name}", *toy, *QUICK)
+    name, *words = name.split()
+    code, _, err = cli("-m", f"experiment={f'[paper,{name}]' if paper else name}", *toy, *words,
+                       *QUICK)  # fmt: skip
     assert code == 0, err
     [sweep] = Path("outputs/sweeps").iterdir()
     assert {(job, state) for job, state, _ in states(sweep)} == {(job, "finished") for job in jobs}

@@ -15,6 +15,7 @@ from src.data.bodies import Bodies
 from src.data.faust import Faust
 from src.data.faust_benchmark import FaustBenchmark
 from src.data.shapes import DataError
+from src.data.sources import open_shapes
 from src.geometry.mesh import Mesh
 
 SITES = ["https://faust-leaderboard.is.tuebingen.mpg.de", "http://faust.is.tue.mpg.de"]
@@ -350,3 +351,17 @@ def test_the_configuration_has_every_argument(data_set):
     for argument in inspect.signature(data_set).parameters.values():
         default = None if argument.default is argument.empty else argument.default
         assert config[argument.name] == default
+
+
+@pytest.mark.parametrize("name", ["faust_remeshed", "bodies_6890_remeshed"])
+def test_each_shape_can_be_remeshed_on_its_own(name, extracted, tmp_path):
+    config = yaml.safe_load((Path(__file__).parents[2] / f"conf/data/{name}.yaml").read_text())
+    assert config["remesh"] == {"policy": "isotropic", "vertices": 5000, "copies": 1}
+    config["remesh"]["vertices"] = 300
+    root = {"root": str(extracted)} if "root" in config else {}
+    shapes = open_shapes({**config, **root, "cache_dir": str(tmp_path), "workers": 1})
+    name = shapes.names["test"][0]
+    shape, source = shapes.load(name), shapes.source(name)
+    assert len(shape.mesh.vertices) == 300 and shape.template_size == 6890
+    there = source.mesh.vertices[shape.labels]  # the labels are where the vertices are
+    assert np.linalg.norm(there - shape.mesh.vertices, axis=1).max() < 0.05

@@ -6,7 +6,9 @@ import json
 
 import numpy as np
 import pytest
+from tqdm import tqdm
 
+from src.data.preprocessing import _run_in_pool
 from src.data.remeshed import Remeshed, usual_size
 from src.data.shapes import DataError, ShapeSet, registered_shape
 from src.data.sources import open_shapes
@@ -49,6 +51,17 @@ def test_a_shape_is_remeshed_once_and_kept(toys, monkeypatch):
     np.testing.assert_array_equal(shape.mesh.vertices, again.mesh.vertices)
     with pytest.raises(TypeError):
         toys.load("val/0.ply")
+
+
+def test_a_pool_makes_the_same_meshes(toys, tmp_path):
+    names = ["train/0.ply", "train/1.ply", "val/0.ply"]
+    tasks = [toys._task(toys.source(name).mesh, 1) for name in names]
+    _run_in_pool(tasks, Store(tmp_path / "pool"), 2, tqdm(disable=True))
+    pooled = Remeshed(Toys(), Store(tmp_path / "pool"), 1, "isotropic", 120)
+    for name in names:
+        here, there = toys.load(name).mesh, pooled.load(name).mesh
+        np.testing.assert_array_equal(there.vertices, here.vertices)
+        np.testing.assert_array_equal(there.faces, here.faces)
 
 
 def test_training_shapes_can_have_several_tessellations(tmp_path):
