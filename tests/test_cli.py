@@ -203,7 +203,7 @@ def test_the_documented_commands_compose():
                 commands.append([w for w in words if "=" in w])
     assert len(commands) > 8
     for words in commands:
-        single = [w if w.startswith("data.") else w.split(",")[0] for w in words]
+        single = [w if w.startswith("data.") or "[" in w else w.split(",")[0] for w in words]
         if not any(word.startswith("resume") for word in words):
             composed(single)
 
