@@ -70,8 +70,7 @@ def entry_point(
             try:
                 hydra.main(config_path=CONF, config_name=name, version_base="1.3")(job)()
             except Stopped as stopped:
-                again = " To go on: the same command" if Table.folder else ""
-                print(f"\n{stopped}{again * (str(stopped) == 'Stopped.')}", file=sys.stderr)
+                print(f"\n{stopped}", file=sys.stderr)
                 sys.exit(128 + stopped.signum)
             except USER_ERRORS as error:
                 print(f"error: {one_line(error)}", file=sys.stderr)
@@ -93,7 +92,8 @@ def entry_point(
 
 
 def _stop(signum: int, frame: object) -> None:
-    raise Stopped(signum)
+    again = " To go on: the same command" if Table.folder else ""
+    raise Stopped(signum, f"Stopped.{again}")
 
 
 def one_line(error: BaseException) -> str:

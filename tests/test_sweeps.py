@@ -29,7 +29,7 @@ from src.runs import (
     alone,
     claim,
     write_metrics,
-)  # fmt: skip
+)
 from src.sweeps import FAILED, announce, legal_name, run_folder, states, sweep_folder
 from src.train import train_apart
 from tests.test_cli import QUICK, cli  # noqa: F401
@@ -143,10 +143,10 @@ def test_jobs_run_in_processes_of_their_own(toy_overrides, tmp_path, launcher):
                           env={**env, "PYTHONPATH": str(ROOT)}, capture_output=True,
                           text=True)  # fmt: skip
     assert done.returncode == 1, done.stderr
-    if launcher == "joblib":  # as many jobs as cores at once
-        [log] = (tmp_path / "outputs" / "sweeps").glob("*/optim.lr-0.01/train.log")
-        assert "32-true on cpu, 1 thread\n" in log.read_text()
     [sweep] = (tmp_path / "outputs" / "sweeps").iterdir()
+    if launcher == "joblib":  # as many jobs as cores at once
+        log = (sweep / "optim.lr-0.01" / "train.log").read_text()
+        assert "32-true on cpu, 1 thread\n" in log
     assert "launcher" not in sweep.name
     found = {job: state for job, state, _ in states(sweep)}
     assert found == {

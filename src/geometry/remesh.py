@@ -157,14 +157,14 @@ class Tool:
             import pymeshlab
         except ImportError as error:
             raise MeshError("remeshing needs PyMeshLab: pip install -e '.[remesh]'") from error
-        self._lab, self._source, self.vertices, self._rng = pymeshlab, mesh, vertices, rng
+        self._lab, self.source, self.vertices, self._rng = pymeshlab, mesh, vertices, rng
         self.area = mesh.area
         self.edge = mean_edge(self.area, vertices)
         self.reset()
 
     def reset(self) -> None:
         """The source again, numbered at random."""
-        mesh = self._source.renumbered(self._rng.permutation(len(self._source.vertices)))
+        mesh = self.source.renumbered(self._rng.permutation(len(self.source.vertices)))
         faces = self._rng.permutation(mesh.faces)
         self._set = self._lab.MeshSet()
         self._set.add_mesh(self._lab.Mesh(mesh.vertices, faces))
@@ -206,10 +206,10 @@ class Tool:
             qualityweight=False, autoclean=True, selected=selected,
         )  # fmt: skip
 
-    def select_bent(self, share: float) -> None:
-        """The most curved faces, up to that share of the area."""
+    def select_bent(self, bent: np.ndarray, share: float) -> None:
+        """The most curved faces, up to that share of the area. bent: of the source's vertices."""
         points, faces = self.result()
-        bent = bending(self._source, self.edge)[cKDTree(self._source.vertices).query(points)[1]]
+        bent = bent[cKDTree(self.source.vertices).query(points)[1]]
         order = np.argsort(-bent[faces].mean(axis=1))
         area = np.cumsum(trimesh.triangles.area(points[faces[order]]))
         last = order[np.searchsorted(area, share * area[-1])]
@@ -237,7 +237,7 @@ class Tool:
         )  # fmt: skip
         pieces = trimesh.Trimesh(*self.result(), process=False).split(only_watertight=False)
         if not len(pieces):
-            raise MeshError(f"{self._source.name}: too thin for marching cubes of that size")
+            raise MeshError(f"{self.source.name}: too thin for marching cubes of that size")
         largest = max(pieces, key=lambda piece: len(piece.vertices))
         self._set = self._lab.MeshSet()
         self._set.add_mesh(self._lab.Mesh(largest.vertices, largest.faces))
@@ -256,10 +256,11 @@ def _isotropic(tool: Tool, rng: np.random.Generator) -> None:
 def _adaptive(tool: Tool, rng: np.random.Generator) -> None:
     _finely(tool, rng)
     tool.isotropic(1.35 * tool.edge, 8)
+    bent = bending(tool.source, tool.edge)
     for share, length in ((0.35, 0.85), (0.12, 0.55)):
-        tool.select_bent(share)
+        tool.select_bent(bent, share)
         tool.isotropic(length * tool.edge, 4, selected=True)
-    tool.select_bent(0.35)
+    tool.select_bent(bent, 0.35)
     tool.simplify_the_rest()
 
 
