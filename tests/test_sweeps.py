@@ -325,8 +325,11 @@ def test_the_launchers_have_configs(cli, launcher):  # noqa: F811
                       for p in ("isotropic", "mixed") for x in ("true", "false")}),
         ("lengths", {f"model-{m}_seq_len-{n}_metric-{x}" for m in ("fcs", "lstm")
                      for n in (15, 20, 30) for x in ("true", "false")}),
+        ("parameters", {f"model-fcs_seq_len-{n}" for n in (15, 20, 30)}),
+        ("parameters model=lstm,gcnn3 seq_len=30", {"model-gcnn3", "model-lstm"}),
     ],
-    ids=["networks", "rotations", "remeshed_gcnn3", "remeshed", "lengths"],
+    ids=["networks", "rotations", "remeshed_gcnn3", "remeshed", "lengths", "parameters",
+         "parameters_others"],
 )  # fmt: skip
 @pytest.mark.parametrize("paper", [False, True])
 def test_the_paper_s_experiments_are_sweeps(cli, toy_overrides, monkeypatch, name, jobs, paper):  # noqa: F811
@@ -341,7 +344,8 @@ def test_the_paper_s_experiments_are_sweeps(cli, toy_overrides, monkeypatch, nam
     [sweep] = Path("outputs/sweeps").iterdir()
     assert {(job, state) for job, state, _ in states(sweep)} == {(job, "finished") for job in jobs}
     configs = [OmegaConf.load(sweep / job / CONFIG) for job in jobs]
-    assert {c.seq_len for c in configs} == ({15, 20, 30} if name == "lengths" else {30})
+    lengths = name == "lengths" or (name == "parameters" and not words)
+    assert {c.seq_len for c in configs} == ({15, 20, 30} if lengths else {30})
     assert {c.optim.lr for c in configs} == {0.001 if paper else 0.004}
     assert {c.model.dropout for c in configs} == {0.3}
     remeshed = {(c.data.remesh.policy, c.data.remesh.vertices) for c in configs if c.data.remesh}
