@@ -7,6 +7,7 @@ import logging
 import os
 import signal
 import sys
+import traceback
 from collections.abc import Callable
 from pathlib import Path
 
@@ -20,7 +21,7 @@ from omegaconf.errors import OmegaConfBaseException
 from src.config import ConfigError
 from src.data.shapes import DataError
 from src.geometry.mesh import MeshError
-from src.runs import RunError, Stopped
+from src.runs import RunError, Stopped, write_whole
 from src.sweeps import Table, announce, note_failure
 
 CONF = str(Path(__file__).parents[1] / "conf")
@@ -80,8 +81,10 @@ def entry_point(
                     raise
                 Table.show()
                 reason = f"{type(error).__name__}: {' '.join(str(error).split())}"
-                again = "to go on: the same command"
-                print(f"error: a job came to no end ({reason}); {again}", file=sys.stderr)
+                where = Table.folder / "traceback.txt"
+                write_whole(where, traceback.format_exc())
+                print(f"error: a job came to no end ({reason}; traceback in {where}); "
+                      "to go on: the same command", file=sys.stderr)  # fmt: skip
                 sys.exit(1)
             if failed or Table.failed:
                 sys.exit(1)

@@ -269,7 +269,7 @@ def two_at_a_time(toy_overrides, tmp_path):
 
 
 @pytest.mark.skipif(not Path("/proc/self/task").is_dir(), reason="/proc names the workers")
-def test_a_worker_that_is_killed_leaves_the_table_and_a_line(two_at_a_time):
+def test_a_worker_that_is_killed_leaves_the_table_and_a_line(two_at_a_time, tmp_path):
     own = Path(f"/proc/{two_at_a_time.pid}/task/{two_at_a_time.pid}/children")
     children = [Path("/proc", pid) for pid in own.read_text().split()]
     worker = next(c for c in children if "popen_loky" in (c / "cmdline").read_text())
@@ -278,9 +278,11 @@ def test_a_worker_that_is_killed_leaves_the_table_and_a_line(two_at_a_time):
     assert two_at_a_time.returncode == 1
     assert out.count("goes on with the same command") == 2 and "Traceback" not in err
     line = (
-        r"error: a job came to no end \(TerminatedWorkerError: .*\); to go on: the same command\n"
+        r"error: a job came to no end \(TerminatedWorkerError: .*; traceback in (.*)\); "
+        r"to go on: the same command\n"
     )
-    assert re.search(line, err)
+    [where] = re.findall(line, err)
+    assert "TerminatedWorkerError" in (tmp_path / where).read_text()
 
 
 def test_ctrl_c_in_a_launcher_says_how_to_go_on(two_at_a_time):
