@@ -346,8 +346,8 @@ def test_the_paper_s_experiments_are_sweeps(cli, toy_overrides, monkeypatch, nam
     [sweep] = Path("outputs/sweeps").iterdir()
     assert {(job, state) for job, state, _ in states(sweep)} == {(job, "finished") for job in jobs}
     configs = [OmegaConf.load(sweep / job / CONFIG) for job in jobs]
-    lengths = name == "lengths" or (name == "parameters" and not words)
-    assert {c.seq_len for c in configs} == ({15, 20, 30} if lengths else {30})
+    lengths = {15, 20, 30} if any("seq_len-" in job for job in jobs) else {30}
+    assert {c.seq_len for c in configs} == lengths
     assert {c.optim.lr for c in configs} == {0.001 if paper else 0.004}
     assert {c.model.dropout for c in configs} == {0.3}
     remeshed = {(c.data.remesh.policy, c.data.remesh.vertices) for c in configs if c.data.remesh}
