@@ -21,11 +21,11 @@ import torch
 from joblib import Parallel, delayed
 from tqdm import tqdm
 
-from src.data.bodies import Bodies
-from src.data.scans import open_scan
-from src.geometry.mesh import MeshError
-from src.geometry.resample import resample
-from src.matching import Matcher
+from meshspiral.data.datasets.bodies import Bodies
+from meshspiral.data.scans import open_scan
+from meshspiral.geometry.mesh import MeshError
+from meshspiral.geometry.resample import resample
+from meshspiral.matching.matcher import Matcher
 from tests.damage import damaged_file
 
 KINDS = {"plain": (False, False), "resampled": (True, False), "smooth": (False, True)}

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from src.geometry.mesh import Mesh
+from meshspiral.geometry.mesh import Mesh
 from tests.meshes import bumpy_sphere
 
 TOY_SPLIT = {"train": 6, "val": 3, "test": 3}
@@ -61,9 +61,20 @@ def toy_overrides(toy, tmp_path_factory) -> list[str]:
     """The command line that trains a small network on the toy data set."""
     cache = tmp_path_factory.mktemp("cache")
     return [
-        "data=folder", f"data.root={toy}", "data.template=template.ply", "data.labels=identity",
-        "data.train=[train/*.ply]", "data.val=[val/*.ply]", "data.test=[test/*.ply]",
-        f"data.cache_dir={cache}", "data.shot.radius=0.3", "data.shot.bins=4", "data.workers=1",
-        "model.channels=[12,14,16]", "seq_len=8", "trainer.threads=1", "picture=false",
+        "data=folder",
+        f"data.root={toy}",
+        "data.template=template.ply",
+        "data.labels=identity",
+        "data.train=[train/*.ply]",
+        "data.val=[val/*.ply]",
+        "data.test=[test/*.ply]",
+        f"data.cache_dir={cache}",
+        "data.shot.radius=0.3",
+        "data.shot.bins=4",
+        "data.workers=1",
+        "model.channels=[12,14,16]",
+        "seq_len=8",
+        "trainer.threads=1",
+        "picture=false",
         "optim.epochs=4",
-    ]  # fmt: skip
+    ]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import trimesh
 
-from src.geometry.mesh import SUFFIXES, Mesh
+from meshspiral.geometry.mesh import SUFFIXES, Mesh
 
 
 def _pick(rng, array):
@@ -90,8 +90,25 @@ def _pinched(rng, v, f):
     return v, np.where(f == one, two, f)
 
 
-DAMAGES = [_not_finite, _far, _scaled, _collapsed, _flat, _noisy, _torn, _holes, _few, _repeated,
-           _turned, _inside_out, _wild, _degenerate, _lonely, _twice, _pinched]  # fmt: skip
+DAMAGES = [
+    _not_finite,
+    _far,
+    _scaled,
+    _collapsed,
+    _flat,
+    _noisy,
+    _torn,
+    _holes,
+    _few,
+    _repeated,
+    _turned,
+    _inside_out,
+    _wild,
+    _degenerate,
+    _lonely,
+    _twice,
+    _pinched,
+]
 
 
 def damaged(mesh: Mesh, seed: int) -> tuple[np.ndarray, np.ndarray]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import trimesh
 
-from src.geometry.mesh import Mesh
+from meshspiral.geometry.mesh import Mesh
 
 
 def lattice(rows: int, columns: int) -> Mesh:
@@ -14,9 +14,9 @@ def lattice(rows: int, columns: int) -> Mesh:
     x, y = j + 0.5 * i, i * np.sqrt(3) / 2
     vertices = np.stack([x.ravel(), y.ravel(), np.zeros(x.size)], axis=1)
     a = (i * columns + j)[:-1, :-1].ravel()
-    faces = np.concatenate([
-        np.stack([a, a + 1, a + columns], 1), np.stack([a + 1, a + columns + 1, a + columns], 1)
-    ])  # fmt: skip
+    faces = np.concatenate(
+        [np.stack([a, a + 1, a + columns], 1), np.stack([a + 1, a + columns + 1, a + columns], 1)]
+    )
     return Mesh(vertices, faces)
 
 
@@ -46,9 +46,9 @@ def torus(rows: int = 9, columns: int = 13) -> Mesh:
     def at(di, dj):
         return (((i + di) % rows) * columns + (j + dj) % columns).ravel()
 
-    faces = np.concatenate([
-        np.stack([at(0, 0), at(0, 1), at(1, 0)], 1), np.stack([at(0, 1), at(1, 1), at(1, 0)], 1)
-    ])  # fmt: skip
+    faces = np.concatenate(
+        [np.stack([at(0, 0), at(0, 1), at(1, 0)], 1), np.stack([at(0, 1), at(1, 1), at(1, 0)], 1)]
+    )
     return Mesh(vertices, faces)
 
 

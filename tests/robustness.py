@@ -16,15 +16,15 @@ import numpy as np
 import trimesh
 from tqdm import tqdm
 
-from src.data.bodies import Bodies
-from src.data.reference import ReferenceDistances
-from src.data.remeshed import Remeshed
-from src.data.scans import scan
-from src.data.shapes import Shape
-from src.data.store import Store
-from src.evaluation import evenly
-from src.matching import Matcher
-from src.metrics import geodesic_errors, point_errors
+from meshspiral.data.cache import Store
+from meshspiral.data.datasets.bodies import Bodies
+from meshspiral.data.reference import ReferenceDistances
+from meshspiral.data.remeshed import Remeshed
+from meshspiral.data.scans import scan
+from meshspiral.data.shapes import Shape
+from meshspiral.evaluation.metrics import geodesic_errors, point_errors
+from meshspiral.evaluation.outcome import evenly
+from meshspiral.matching.matcher import Matcher
 
 STORE = Store("outputs/cache")
 HOLES = "a tenth of the faces gone"
@@ -58,24 +58,42 @@ def main() -> None:
     rng = np.random.default_rng(0)
     cases = {
         what: [changed(body, what, rng) for body in plain]
-        for what in ("as they are", "rotated", "times 1000, moved by 1 km", "renumbered",
-                     "noise of 2 mm", HOLES, "cut off at the waist")
-    }  # fmt: skip
-    for policy, vertices in [("isotropic", 750), ("isotropic", 1500), ("isotropic", 3000),
-                             ("isotropic", 15000), ("mixed", 1500)]:  # fmt: skip
+        for what in (
+            "as they are",
+            "rotated",
+            "times 1000, moved by 1 km",
+            "renumbered",
+            "noise of 2 mm",
+            HOLES,
+            "cut off at the waist",
+        )
+    }
+    for policy, vertices in [
+        ("isotropic", 750),
+        ("isotropic", 1500),
+        ("isotropic", 3000),
+        ("isotropic", 15000),
+        ("mixed", 1500),
+    ]:
         made = Remeshed(bodies, STORE, None, policy, vertices)
         made.prepare(names)
         cases[f"{policy}, {vertices:,} vertices"] = [made.load(name) for name in names]
-    options = {"default": {}, "smooth": {"smooth": True}, "never resampled": {"resampled": False},
-               "always resampled": {"resampled": True}}  # fmt: skip
+    options = {
+        "default": {},
+        "smooth": {"smooth": True},
+        "never resampled": {"resampled": False},
+        "always resampled": {"resampled": True},
+    }
     print(f"{'':36}" + "".join(f"{name:>26}" for name in options))
     matchers = [Matcher.load(run and Path(run), **each) for each in options.values()]
     cases["the same, repair=true"] = cases[HOLES]
     for what, shapes in cases.items():
         mend = "repair" in what
         row = [measured(matcher, shapes, reference, mend) for matcher in matchers]
-        print(f"{what:36}" + "".join(f"{100 * e:8.1f} % {m:7.4f} {s:6.2f} s" for e, m, s in row),
-              flush=True)  # fmt: skip
+        print(
+            f"{what:36}" + "".join(f"{100 * e:8.1f} % {m:7.4f} {s:6.2f} s" for e, m, s in row),
+            flush=True,
+        )
     for what in ("as they are", "isotropic, 1,500 vertices", "mixed, 1,500 vertices"):
         print(f"by confidence, {what}:\n{by_confidence(matchers[0], cases[what], reference)}")
 
@@ -84,17 +102,21 @@ def by_confidence(matcher: Matcher, shapes: list[Shape], reference: ReferenceDis
     """The share of vertices in each fifth of the confidences, and how far off they are."""
     found = [matcher.label(scan(s.mesh.vertices, s.mesh.faces, s.mesh.name)) for s in shapes]
     confidence = np.concatenate([labels.confidence for labels in found])
-    errors = np.concatenate([
-        geodesic_errors(labels.template.astype(np.int64), shape.labels, reference)
-        for labels, shape in zip(found, shapes, strict=True)
-    ])  # fmt: skip
+    errors = np.concatenate(
+        [
+            geodesic_errors(labels.template.astype(np.int64), shape.labels, reference)
+            for labels, shape in zip(found, shapes, strict=True)
+        ]
+    )
     lines = []
     for low in (0.0, 0.2, 0.4, 0.6, 0.8):
         among = (confidence >= low) & (confidence < low + 0.2 + (low == 0.8))
         if among.any():
-            lines.append(f"  {low:.1f} to {low + 0.2:.1f}: {100 * among.mean():5.1f} % of the "
-                         f"vertices, {100 * (errors[among] == 0).mean():5.1f} % exact, "
-                         f"{100 * (errors[among] < 0.05).mean():5.1f} % within 0.05")  # fmt: skip
+            lines.append(
+                f"  {low:.1f} to {low + 0.2:.1f}: {100 * among.mean():5.1f} % of the "
+                f"vertices, {100 * (errors[among] == 0).mean():5.1f} % exact, "
+                f"{100 * (errors[among] < 0.05).mean():5.1f} % within 0.05"
+            )
     return "\n".join(lines)
 
 

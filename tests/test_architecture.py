@@ -76,10 +76,10 @@ def test_imports_point_against_the_flow(path):
 
 def test_a_wrong_import_is_found():
     assert violations("geometry", "def f():\n    import torch") == {"torch"}
-    assert violations("nn", "from src.data.store import Store") == {"data"}
-    assert violations("data", "from src import nn\nimport src.nn.layers") == {"nn"}
-    assert violations("evaluate", "from src.train import main") == {"train"}
-    assert violations("evaluate", "from src.correspondence import Correspondence") == set()
+    assert violations("nn", "from meshspiral.data.cache import Store") == {"data"}
+    assert violations("data", "from src import nn\nimport meshspiral.nn.layers") == {"nn"}
+    assert violations("evaluate", "from meshspiral.commands.train import main") == {"train"}
+    assert violations("evaluate", "from meshspiral.training.module import Correspondence") == set()
 
 
 @pytest.mark.parametrize("path", MODULES, ids=lambda path: str(path.relative_to(SRC)))

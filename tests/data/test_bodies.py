@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 import yaml
 
-from src.data.bodies import Bodies
-from src.data.shapes import DataError
-from src.geometry.mesh import Mesh
+from meshspiral.data.datasets.bodies import Bodies
+from meshspiral.data.shapes import DataError
+from meshspiral.geometry.mesh import Mesh
 
 ROOT = Path(__file__).parents[2]
-ASSETS = ROOT / "src" / "data" / "assets"
+ASSETS = ROOT / "src" / "meshspiral" / "data" / "assets"
 SIZES = {1500: 2996, 6890: 13776}
 
 
@@ -143,7 +143,7 @@ def test_the_source_of_the_bodies_is_credited():
     for credit in ["Anny", "NAVER", "Apache License, Version 2.0", "MakeHuman", "CC0"]:
         assert credit in notice
     for vertices in SIZES:
-        assert f"src/data/assets/bodies_{vertices}.npz" in notice
+        assert f"src/meshspiral/data/assets/bodies_{vertices}.npz" in notice
     assert "MIT License" in (ROOT / "LICENSE").read_text()
 
 

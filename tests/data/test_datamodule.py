@@ -11,9 +11,10 @@ import pytest
 import torch
 from tqdm import tqdm
 
-from src.data import preprocessing
-from src.data.datamodule import CorrespondenceData, EpochSampler, draw_spirals
-from src.data.preprocessing import (
+from meshspiral.data import preprocessing
+from meshspiral.data.cache import Store
+from meshspiral.data.datamodule import CorrespondenceData, EpochSampler, draw_spirals
+from meshspiral.data.preprocessing import (
     PatchRecipe,
     Recipe,
     Task,
@@ -24,15 +25,14 @@ from src.data.preprocessing import (
     patch_task,
     spiral_task,
 )
-from src.data.shapes import DataError, Shape, ShapeSet
-from src.data.store import Store
-from src.geometry.geodesics import diameter
-from src.geometry.mesh import Mesh, MeshError
-from src.geometry.patches import geodesic_patches
-from src.geometry.shot import shot_descriptors
-from src.geometry.spirals import spiral_table
-from src.geometry.windows import gaussian_windows
-from src.nn.layers import metric_features
+from meshspiral.data.shapes import DataError, Shape, ShapeSet
+from meshspiral.geometry.geodesics import diameter
+from meshspiral.geometry.mesh import Mesh, MeshError
+from meshspiral.geometry.patches import geodesic_patches
+from meshspiral.geometry.shot import shot_descriptors
+from meshspiral.geometry.spirals import spiral_table
+from meshspiral.geometry.windows import gaussian_windows
+from meshspiral.nn.layers import metric_features
 from tests.conftest import TOY_SPLIT, toy_shapes
 from tests.meshes import bumpy_sphere, lattice, punctured, union
 
@@ -108,8 +108,14 @@ def test_items_hold_what_they_say(store):
     dtypes = {
         name: str(t.dtype).removeprefix("torch.") for name, t in item.items() if name != "index"
     }
-    assert dtypes == {"features": "float32", "sequences": "int32", "first": "int64",
-                      "labels": "int64", "vertices": "float32", "unit": "float32"}  # fmt: skip
+    assert dtypes == {
+        "features": "float32",
+        "sequences": "int32",
+        "first": "int64",
+        "labels": "int64",
+        "vertices": "float32",
+        "unit": "float32",
+    }
     assert data.num_classes == 162 and data.in_features == item["features"].shape[1] == 32 * 5
 
 
@@ -204,9 +210,13 @@ def test_patches_are_served_by_rows_and_by_columns(store):
     assert not item.keys() & {"sequences", "first"}
     dtypes = {name: str(t.dtype).removeprefix("torch.") for name, t in item["patches"].items()}
     assert dtypes == {
-        "vertices": "int32", "weights": "float32", "first": "int32",
-        "samples": "int32", "sample_weights": "float32", "sample_first": "int32",
-    }  # fmt: skip
+        "vertices": "int32",
+        "weights": "float32",
+        "first": "int32",
+        "samples": "int32",
+        "sample_weights": "float32",
+        "sample_first": "int32",
+    }
     mesh = data.shapes.load("val/1.ply").mesh
     table = geodesic_patches(mesh, 0.1 * diameter(mesh), 3, 8, first_directions(mesh))
     expected = np.zeros((162, 3, 8, 162))
@@ -308,8 +318,9 @@ def test_a_second_run_computes_nothing(store, monkeypatch):
 def test_keys_depend_on_every_parameter(change):
     mesh = bumpy_sphere()
     other = Recipe(**{**RECIPE.__dict__, **change})
-    keys = [task(mesh, RECIPE).key == task(mesh, other).key
-            for task in (descriptor_task, spiral_task)]  # fmt: skip
+    keys = [
+        task(mesh, RECIPE).key == task(mesh, other).key for task in (descriptor_task, spiral_task)
+    ]
     assert sorted(keys) == [False, True]
 
 

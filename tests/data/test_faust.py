@@ -11,12 +11,12 @@ import numpy as np
 import pytest
 import yaml
 
-from src.data.bodies import Bodies
-from src.data.faust import Faust
-from src.data.faust_benchmark import FaustBenchmark
-from src.data.shapes import DataError
-from src.data.sources import open_shapes
-from src.geometry.mesh import Mesh
+from meshspiral.data.datasets.bodies import Bodies
+from meshspiral.data.datasets.faust import Faust
+from meshspiral.data.datasets.faust_benchmark import FaustBenchmark
+from meshspiral.data.shapes import DataError
+from meshspiral.data.sources import open_shapes
+from meshspiral.geometry.mesh import Mesh
 
 SITES = ["https://faust-leaderboard.is.tuebingen.mpg.de", "http://faust.is.tue.mpg.de"]
 REGISTRATIONS = "training/registrations"

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 import yaml
 
-from src.data.folder import Folder
-from src.data.shapes import DataError, read_labels
+from meshspiral.data.datasets.folder import Folder
+from meshspiral.data.shapes import DataError, read_labels
 
 TETRAHEDRON = "OFF\n4 4 0\n0 0 0\n1 0 0\n0 1 0\n0 0 {}\n3 0 2 1\n3 0 1 3\n3 1 2 3\n3 0 3 2\n"
 PYRAMID = (

@@ -8,19 +8,19 @@ import numpy as np
 import pytest
 from tqdm import tqdm
 
-from src.data.preprocessing import _run_in_pool
-from src.data.remeshed import Remeshed, usual_size
-from src.data.shapes import DataError, ShapeSet, registered_shape
-from src.data.sources import open_shapes
-from src.data.store import Store
-from src.evaluation import ERRORS, Outcome
-from src.geometry import remesh as module
-from src.meshes import COLUMNS, edges, main, row, shared
-from src.runs import METRICS
+from meshspiral.commands.meshes import COLUMNS, edges, main, row, shared
+from meshspiral.data.cache import Store
+from meshspiral.data.preprocessing import _run_in_pool
+from meshspiral.data.remeshed import Remeshed, usual_size
+from meshspiral.data.shapes import DataError, ShapeSet, registered_shape
+from meshspiral.data.sources import open_shapes
+from meshspiral.evaluation.outcome import ERRORS, Outcome
+from meshspiral.experiment.runs import METRICS
+from meshspiral.geometry import remesh as module
+from tests.commands.test_train import FIGURES, run
 from tests.conftest import toy_shapes
+from tests.experiment.test_cli import cli  # noqa: F401
 from tests.meshes import bow_tie, punctured
-from tests.test_cli import cli  # noqa: F401
-from tests.test_train import FIGURES, run
 
 
 class Toys(ShapeSet):
@@ -67,8 +67,14 @@ def test_a_pool_makes_the_same_meshes(toys, tmp_path):
 def test_training_shapes_can_have_several_tessellations(tmp_path):
     shapes = Remeshed(Toys(), Store(tmp_path), 1, "isotropic", 120, copies=3)
     names = ["train/0.ply", "train/0.ply~2", "train/0.ply~3"]
-    assert shapes.names["train"] == [names[0], "train/1.ply", names[1], "train/1.ply~2", names[2],
-                                     "train/1.ply~3"]  # fmt: skip
+    assert shapes.names["train"] == [
+        names[0],
+        "train/1.ply",
+        names[1],
+        "train/1.ply~2",
+        names[2],
+        "train/1.ply~3",
+    ]
     assert shapes.names["val"] == ["val/0.ply"]
     shapes.prepare(names)
     loaded = [shapes.load(name).mesh.vertices for name in names]
@@ -127,7 +133,7 @@ def test_another_policy_or_size_is_another_mesh(toys, tmp_path):
 
 
 def test_without_pymeshlab_there_is_one_line(tmp_path, monkeypatch):
-    monkeypatch.setattr("src.data.remeshed.version", lambda _: raise_missing())
+    monkeypatch.setattr("meshspiral.data.remeshed.version", lambda _: raise_missing())
     with pytest.raises(DataError, match=r"pip install -e '.\[remesh\]'"):
         Remeshed(Toys(), Store(tmp_path), 1, "isotropic", 120)
 
@@ -177,7 +183,7 @@ def test_the_meshes_of_a_data_set_in_a_table(cli, toy_overrides):  # noqa: F811
         ([REMESHED, "data.remesh.vertices=3"], "data.remesh.vertices must be at least 12"),
         ([REMESHED, "+data.remesh.depth=3"], "unknown key data.remesh.depth"),
     ],
-)  # fmt: skip
+)
 def test_a_mistake_is_one_clear_line(cli, arguments, message):  # noqa: F811
     code, out, err = cli(*arguments, program=main)
     assert code == 1 and message in (out + err).strip().splitlines()[-1]

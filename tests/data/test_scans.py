@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 import trimesh
 
-from src.data.attributes import read_attribute
-from src.data.scans import open_scan, scan
-from src.data.shapes import DataError
-from src.geometry.mesh import SUFFIXES, MeshError
+from meshspiral.data.attributes import read_attribute
+from meshspiral.data.scans import open_scan, scan
+from meshspiral.data.shapes import DataError
+from meshspiral.geometry.mesh import SUFFIXES, MeshError
 from tests.meshes import bumpy_sphere, lattice
 
 SPHERE = bumpy_sphere()
@@ -193,8 +193,10 @@ def test_a_texture_does_not_give_a_ply_other_vertices(tmp_path):
 
 def test_colours_of_an_obj_may_go_to_255_and_uv_may_be_missing(tmp_path):
     path = tmp_path / "a.obj"
-    path.write_text("v 0 0 0 255 0 9\nv 1 0 0 0 0 0\nv 0 1 0 1 2 3\nv 2 2 2 1 1 1\nvt 0 0\n"
-                    "f 1/1 2/1 3/1\nf 2 4 3\n")  # fmt: skip
+    path.write_text(
+        "v 0 0 0 255 0 9\nv 1 0 0 0 0 0\nv 0 1 0 1 2 3\nv 2 2 2 1 1 1\nvt 0 0\n"
+        "f 1/1 2/1 3/1\nf 2 4 3\n"
+    )
     np.testing.assert_array_equal(read_attribute(path, "color", 4)[0], [255, 0, 9])
     with pytest.raises(DataError, match="1 of the 4 vertices of faces have no uv"):
         read_attribute(path, "uv", 4)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from src.geometry.angles import arccos, arctan, eighth
+from meshspiral.geometry.angles import arccos, arctan, eighth
 
 
 def test_fast_angles_are_those_of_numpy():

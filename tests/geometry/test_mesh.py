@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from src.geometry.mesh import Mesh, MeshError, parse_mesh, read_mesh
+from meshspiral.geometry.mesh import Mesh, MeshError, parse_mesh, read_mesh
 from tests.meshes import bumpy_sphere, lattice, punctured, random_meshes
 
 SQUARE = [[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]]
@@ -75,21 +75,30 @@ f -2 -1 3
 @pytest.mark.parametrize(
     "vertices, faces, message",
     [
-        ([[0, 0, np.nan], [1, 0, 0], [0, np.inf, 0]], [[0, 1, 2]],
-         r"2 vertices with coordinates that are not finite: vertex 0 = \(0, 0, nan\); vertex 2"),
-        (SQUARE, [[0, 1, 2], [0, 2, 4]],
-         r"1 face naming a vertex outside 0..3: face 1 = \(0, 2, 4\)"),
+        (
+            [[0, 0, np.nan], [1, 0, 0], [0, np.inf, 0]],
+            [[0, 1, 2]],
+            r"2 vertices with coordinates that are not finite: vertex 0 = \(0, 0, nan\); vertex 2",
+        ),
+        (
+            SQUARE,
+            [[0, 1, 2], [0, 2, 4]],
+            r"1 face naming a vertex outside 0..3: face 1 = \(0, 2, 4\)",
+        ),
         (SQUARE, [[0, 1, -1]], r"outside 0..3"),
         (SQUARE, [[0, 1, 2], [2, 3, 3]], r"1 face naming a vertex twice: face 1 = \(2, 3, 3\)"),
-        ([*SQUARE, [0, 0, 1], [0, 0, -1]], [[0, 1, 2], [0, 1, 4], [0, 1, 5]],
-         r"1 edge with more than two faces: \(0, 1\)"),
+        (
+            [*SQUARE, [0, 0, 1], [0, 0, -1]],
+            [[0, 1, 2], [0, 1, 4], [0, 1, 5]],
+            r"1 edge with more than two faces: \(0, 1\)",
+        ),
         (SQUARE, [[0, 1, 2], [0, 3, 2], [0, 2, 3]], r"1 edge with more than two faces: \(0, 2\)"),
         (SQUARE, [[0, 1, 2], [0, 3, 2], [1, 3, 0]], r"wound against each other: \("),
         (np.zeros((0, 3)), [], r"vertices must be \[V, 3\] with V > 0"),
         (SQUARE, [[0, 1, 2, 3]], r"faces must be triangles"),
         (SQUARE, [[0.0, 1.0, 2.0]], r"faces must be integers"),
     ],
-)  # fmt: skip
+)
 def test_what_cannot_be_used_is_refused_with_count_and_first_offenders(vertices, faces, message):
     with pytest.raises(MeshError, match=message) as caught:
         Mesh(vertices, faces, "bad.ply")

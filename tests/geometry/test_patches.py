@@ -6,10 +6,10 @@ import pytest
 import trimesh
 from scipy.spatial import Delaunay
 
-from src.data.bodies import Bodies
-from src.geometry.connectivity import one_rings
-from src.geometry.mesh import Mesh
-from src.geometry.patches import PatchTable, geodesic_patches
+from meshspiral.data.datasets.bodies import Bodies
+from meshspiral.geometry.connectivity import one_rings
+from meshspiral.geometry.mesh import Mesh
+from meshspiral.geometry.patches import PatchTable, geodesic_patches
 from tests.meshes import bow_tie, bumpy_sphere, lattice, punctured, torus, two_cones, union
 
 TURN = 2 * np.pi
@@ -30,10 +30,13 @@ def scattered_square(count: int, seed: int) -> Mesh:
     rng = np.random.default_rng(seed)
     t, zero, one = rng.uniform(0.02, 0.98, (4, 10)), np.zeros(10), np.ones(10)
     sides = zip((t[0], one, t[2], zero), (zero, t[1], one, t[3]), strict=True)
-    xy = np.concatenate([
-        [[0, 0], [1, 0], [1, 1], [0, 1]], *(np.stack(side, 1) for side in sides),
-        rng.random((count, 2)),
-    ])  # fmt: skip
+    xy = np.concatenate(
+        [
+            [[0, 0], [1, 0], [1, 1], [0, 1]],
+            *(np.stack(side, 1) for side in sides),
+            rng.random((count, 2)),
+        ]
+    )
     faces = Delaunay(xy).simplices
     u, v = xy[faces[:, 1]] - xy[faces[:, 0]], xy[faces[:, 2]] - xy[faces[:, 0]]
     wrong = u[:, 0] * v[:, 1] < u[:, 1] * v[:, 0]
@@ -219,8 +222,9 @@ def test_folding_a_flat_mesh_along_its_edges_changes_nothing():
     flat = lattice(8, 9)
     row = np.arange(8 * 9) // 9
     x, y, _ = flat.vertices.T
-    folded = Mesh(np.stack([x, y * np.cos(0.9), row % 2 * np.sqrt(3) / 2 * np.sin(0.9)], 1),
-                  flat.faces)  # fmt: skip
+    folded = Mesh(
+        np.stack([x, y * np.cos(0.9), row % 2 * np.sqrt(3) / 2 * np.sin(0.9)], 1), flat.faces
+    )
     one, other = geodesic_patches(flat, 3.3), geodesic_patches(folded, 3.3)
     np.testing.assert_array_equal(one.indices, other.indices)
     np.testing.assert_allclose(one.weights, other.weights, rtol=0, atol=1e-5)
@@ -637,8 +641,9 @@ def test_a_grid_without_samples_is_refused(rings, rays):
 def test_turned_by_whole_rays_the_samples_move_on_by_as_many(mesh):
     shifts = np.arange(len(mesh.vertices)) % 16
     little = 1e-3  # so that no ray meets an edge of the lattice's boundary
-    plain, turned = (geodesic_patches(mesh, 0.5, turn=s * 2 * np.pi / 16 + little)
-                     for s in (0 * shifts, shifts))  # fmt: skip
+    plain, turned = (
+        geodesic_patches(mesh, 0.5, turn=s * 2 * np.pi / 16 + little) for s in (0 * shifts, shifts)
+    )
     for v, shift in enumerate(shifts):
         np.testing.assert_array_equal(turned.indices[v], np.roll(plain.indices[v], -shift, axis=1))
         np.testing.assert_allclose(
@@ -649,10 +654,14 @@ def test_turned_by_whole_rays_the_samples_move_on_by_as_many(mesh):
 def test_on_a_plane_a_turn_is_an_angle():
     mesh = lattice(9, 9)
     plain, turned = (geodesic_patches(mesh, 2.0, turn=np.full(81, t)) for t in (0.0, 0.3))
-    a, b = (np.einsum("rsk,rskx->rsx", t.weights[40], mesh.vertices[t.indices[40]])
-            for t in (plain, turned))  # fmt: skip
+    a, b = (
+        np.einsum("rsk,rskx->rsx", t.weights[40], mesh.vertices[t.indices[40]])
+        for t in (plain, turned)
+    )
     cosine, sine = np.cos(0.3), np.sin(0.3)
     a, b = a - mesh.vertices[40], b - mesh.vertices[40]
-    rotated = np.stack([cosine * a[..., 0] - sine * a[..., 1],
-                        sine * a[..., 0] + cosine * a[..., 1], a[..., 2]], axis=-1)  # fmt: skip
+    rotated = np.stack(
+        [cosine * a[..., 0] - sine * a[..., 1], sine * a[..., 0] + cosine * a[..., 1], a[..., 2]],
+        axis=-1,
+    )
     np.testing.assert_allclose(b, rotated, atol=1e-5)

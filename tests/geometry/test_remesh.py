@@ -9,9 +9,9 @@ import pytest
 import trimesh
 from scipy.spatial import cKDTree
 
-from src.config import ONE_OF
-from src.geometry.mesh import Mesh, MeshError
-from src.geometry.remesh import POLICIES, Tool, bending, closest_points, remesh
+from meshspiral.experiment.schema import ONE_OF
+from meshspiral.geometry.mesh import Mesh, MeshError
+from meshspiral.geometry.remesh import POLICIES, Tool, bending, closest_points, remesh
 from tests.meshes import bumpy_sphere, lattice
 
 KINDS = [policy for policy in POLICIES if policy != "mixed"]

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from src.geometry.mesh import Mesh, MeshError
-from src.geometry.repair import repair
+from meshspiral.geometry.mesh import Mesh, MeshError
+from meshspiral.geometry.repair import repair
 from tests.damage import damaged
 from tests.meshes import bumpy_sphere, lattice, punctured, torus
 
@@ -53,8 +53,9 @@ def test_vertices_at_one_place_become_one():
     torn = SPHERE.vertices[SPHERE.faces.ravel()]
     found = repair(torn, np.arange(len(torn)).reshape(-1, 3), "a")
     assert len(found.mesh.vertices) == len(SPHERE.vertices)
-    assert found.changes == [f"{len(torn) - len(SPHERE.vertices):,} vertices joined with others at "
-                             "their place"]  # fmt: skip
+    assert found.changes == [
+        f"{len(torn) - len(SPHERE.vertices):,} vertices joined with others at their place"
+    ]
     np.testing.assert_array_equal(found.mesh.vertices[found.place], torn)
 
 
@@ -81,8 +82,9 @@ def test_a_moebius_strip_is_cut_open_once():
     n = 12
     angle = 2 * np.pi * np.arange(n) / n
     ring = np.stack([np.cos(angle), np.sin(angle), 0 * angle], 1)
-    lean = np.stack([np.cos(angle) * np.cos(angle / 2), np.sin(angle) * np.cos(angle / 2),
-                     np.sin(angle / 2)], 1)  # fmt: skip
+    lean = np.stack(
+        [np.cos(angle) * np.cos(angle / 2), np.sin(angle) * np.cos(angle / 2), np.sin(angle / 2)], 1
+    )
     vertices = np.concatenate([ring - 0.3 * lean, ring + 0.3 * lean])
     faces = []
     for i in range(n):

@@ -5,16 +5,17 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from src.geometry.mesh import Mesh, MeshError
-from src.geometry.remesh import closest_points
-from src.geometry.resample import resample, surplus, without_repeats
+from meshspiral.geometry.mesh import Mesh, MeshError
+from meshspiral.geometry.remesh import closest_points
+from meshspiral.geometry.resample import resample, surplus, without_repeats
 from tests.meshes import bumpy_sphere, lattice, punctured
 
 SPHERE = bumpy_sphere(subdivisions=4)  # 2562 vertices
 
 
-@pytest.mark.parametrize("mesh", [SPHERE, bumpy_sphere(subdivisions=1), lattice(30, 30),
-                                  punctured(SPHERE, 0.01)])  # fmt: skip
+@pytest.mark.parametrize(
+    "mesh", [SPHERE, bumpy_sphere(subdivisions=1), lattice(30, 30), punctured(SPHERE, 0.01)]
+)
 @pytest.mark.parametrize("count", [150, 1200])
 def test_the_surface_stays_and_the_old_vertices_lie_on_it(mesh, count):
     found = resample(mesh, count)

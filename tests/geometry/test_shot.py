@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 import trimesh
 
-from src.geometry.mesh import Mesh
-from src.geometry.shot import _descriptors_and_frames, shot_descriptors
+from meshspiral.geometry.mesh import Mesh
+from meshspiral.geometry.shot import _descriptors_and_frames, shot_descriptors
 
 DATA = Path(__file__).parents[1] / "data" / "shot"
 

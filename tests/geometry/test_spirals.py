@@ -5,9 +5,9 @@ import itertools
 import numpy as np
 import pytest
 
-from src.geometry.connectivity import one_rings
-from src.geometry.mesh import Mesh
-from src.geometry.spirals import spiral_table
+from meshspiral.geometry.connectivity import one_rings
+from meshspiral.geometry.mesh import Mesh
+from meshspiral.geometry.spirals import spiral_table
 from tests.meshes import (
     bow_tie,
     bumpy_sphere,
@@ -127,8 +127,20 @@ def test_a_regular_lattice_gives_the_textbook_spiral():
     rows = rows_of(spiral_table(lattice(n, n), 19), 4 * n + 4)
     one = [(0, 1), (-1, 1), (-1, 0), (0, -1), (1, -1), (1, 0)]
     # the two-ring begins with what the first and the last of the one-ring share
-    two = [(1, 1), (0, 2), (-1, 2), (-2, 2), (-2, 1), (-2, 0), (-1, -1), (0, -2), (1, -2), (2, -2),
-           (2, -1), (2, 0)]  # fmt: skip
+    two = [
+        (1, 1),
+        (0, 2),
+        (-1, 2),
+        (-2, 2),
+        (-2, 1),
+        (-2, 0),
+        (-1, -1),
+        (0, -2),
+        (1, -2),
+        (2, -2),
+        (2, -1),
+        (2, 0),
+    ]
     expected = [(4 + i) * n + 4 + j for i, j in [(0, 0), *one, *two]]
     assert next(row for row in rows if row[1] == expected[1]).tolist() == expected
 
@@ -137,9 +149,11 @@ def test_a_regular_lattice_gives_the_textbook_spiral():
 def test_on_a_regular_neighbourhood_the_spiral_never_jumps(mesh):
     table = spiral_table(mesh, 37)
     neighbours = adjacency(mesh)
-    inner = [v for v in range(len(mesh.vertices))
-             if all(len(neighbours[u]) == 6 for u, d in breadth_first(neighbours, v).items()
-                    if d < 3)]  # fmt: skip
+    inner = [
+        v
+        for v in range(len(mesh.vertices))
+        if all(len(neighbours[u]) == 6 for u, d in breadth_first(neighbours, v).items() if d < 3)
+    ]
     assert len(inner) >= 9
     for v in inner:
         for row in rows_of(table, v):
@@ -320,9 +334,13 @@ def test_many_rings_on_rags_end():
 
 @pytest.mark.parametrize(
     "arguments, message",
-    [((0,), "length must be at least 1, got 0"), ((), "either length or rings"),
-     ((5, 2), "either length or rings"), ((None, -1), "rings must be at least 0, got -1")],
-)  # fmt: skip
+    [
+        ((0,), "length must be at least 1, got 0"),
+        ((), "either length or rings"),
+        ((5, 2), "either length or rings"),
+        ((None, -1), "rings must be at least 0, got -1"),
+    ],
+)
 def test_wrong_arguments_are_named(arguments, message):
     length, rings = (*arguments, None, None)[:2]
     with pytest.raises(ValueError, match=message):

@@ -8,10 +8,10 @@ import pytest
 import trimesh
 from scipy.spatial import Delaunay
 
-from src.geometry.connectivity import one_rings
-from src.geometry.mesh import Mesh
-from src.geometry.patches import _directions, _left, geodesic_patches
-from src.geometry.windows import _polar, gaussian_windows
+from meshspiral.geometry.connectivity import one_rings
+from meshspiral.geometry.mesh import Mesh
+from meshspiral.geometry.patches import _directions, _left, geodesic_patches
+from meshspiral.geometry.windows import _polar, gaussian_windows
 from tests.meshes import bow_tie, bumpy_sphere, lattice, punctured, random_meshes, torus
 
 MESHES = random_meshes()
@@ -113,9 +113,10 @@ def check_whole(table, mesh: Mesh, rings: int = 5, rays: int = 16) -> None:
 
 
 @pytest.mark.parametrize(
-    "stretch, radius", [(1, 0.1), (1, 0.3), (1, 9), (30, 90)],
+    "stretch, radius",
+    [(1, 0.1), (1, 0.3), (1, 9), (30, 90)],
     ids=["small", "medium", "all", "needles"],
-)  # fmt: skip
+)
 def test_on_a_plane_distances_and_angles_are_exact(stretch, radius):
     """From inner vertices and from the boundary: in a rectangle every straight line is inside."""
     mesh = plane(1, stretch)
@@ -334,8 +335,9 @@ def test_windows_stand_in_the_directions_of_the_rays():
             means.append(windows.weights[row] @ mesh.vertices[windows.indices[row]])
         distances = [
             np.linalg.norm(np.roll(np.array(means)[::sense], shift, 0) - samples, axis=1).mean()
-            for sense in (1, -1) for shift in range(rays)
-        ]  # fmt: skip
+            for sense in (1, -1)
+            for shift in range(rays)
+        ]
         assert np.argmin(distances) == 0
 
 
@@ -392,11 +394,15 @@ def test_on_a_lattice_opposite_cells_lie_opposite_and_outer_rings_farther_out():
 
 @pytest.mark.parametrize(
     "arguments, message",
-    [((0.0,), "radius must be positive and finite, got 0.0"), ((np.nan,), "got nan"),
-     ((np.inf,), "got inf"), ((-1.0,), "got -1.0"),
-     ((1.0, 0), "rings and rays must be at least 1, got 0 and 16"),
-     ((1.0, 3, 0), "rings and rays must be at least 1, got 3 and 0")],
-)  # fmt: skip
+    [
+        ((0.0,), "radius must be positive and finite, got 0.0"),
+        ((np.nan,), "got nan"),
+        ((np.inf,), "got inf"),
+        ((-1.0,), "got -1.0"),
+        ((1.0, 0), "rings and rays must be at least 1, got 0 and 16"),
+        ((1.0, 3, 0), "rings and rays must be at least 1, got 3 and 0"),
+    ],
+)
 def test_wrong_arguments_are_named(arguments, message):
     with pytest.raises(ValueError, match=message):
         gaussian_windows(torus(), *arguments)

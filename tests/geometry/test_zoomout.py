@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 import trimesh
 
-from src.geometry.mesh import Mesh, MeshError
-from src.geometry.zoomout import TO, eigenfunctions, zoomout
+from meshspiral.geometry.mesh import Mesh, MeshError
+from meshspiral.geometry.zoomout import TO, eigenfunctions, zoomout
 from tests.meshes import bumpy_sphere
 
 MESH = bumpy_sphere(subdivisions=3)

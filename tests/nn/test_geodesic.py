@@ -4,8 +4,8 @@ import pytest
 import torch
 from torch.nn import functional as F
 
-from src.data.preprocessing import by_rows_and_columns
-from src.nn.geodesic import GeodesicConv, Resampling, resample
+from meshspiral.data.preprocessing import by_rows_and_columns
+from meshspiral.nn.geodesic import GeodesicConv, Resampling, resample
 
 RINGS, RAYS = 5, 16
 
@@ -22,8 +22,11 @@ def patches(vertices, rings=RINGS, rays=RAYS, empty=0.0, seed=0):
 
 
 def as_resampling(indices, weights, there):
-    arrays = {"indices": indices[there].flatten().numpy(), "weights": weights[there].flatten(),
-              "first": 3 * F.pad(there.flatten().cumsum(0), (1, 0)).int().numpy()}  # fmt: skip
+    arrays = {
+        "indices": indices[there].flatten().numpy(),
+        "weights": weights[there].flatten(),
+        "first": 3 * F.pad(there.flatten().cumsum(0), (1, 0)).int().numpy(),
+    }
     arrays["weights"] = arrays["weights"].numpy()
     both = by_rows_and_columns(arrays, len(indices))
     return Resampling(**{name: torch.from_numpy(array) for name, array in both.items()})
@@ -37,8 +40,9 @@ def samples_by_hand(features, indices, weights, there):
 
 def plain(weight, samples):
     """The definition: one product for each rotation, and the largest."""
-    rotations = [torch.einsum("orsc,vrsc->vo", weight, samples.roll(-t, 1))
-                 for t in range(samples.shape[1])]  # fmt: skip
+    rotations = [
+        torch.einsum("orsc,vrsc->vo", weight, samples.roll(-t, 1)) for t in range(samples.shape[1])
+    ]
     return torch.stack(rotations).amax(0)
 
 

@@ -6,14 +6,15 @@ import torch
 from torch import nn
 from torch.nn import functional as F
 
-from src.nn import layers, recurrence
-from src.nn.layers import SpiralLinear, SpiralLSTM, metric_features
+from meshspiral.nn import layers, recurrence
+from meshspiral.nn.layers import SpiralLinear, SpiralLSTM, metric_features
 
 
 def sequences(vertices, length, padded, seed=0):
     rng = torch.Generator().manual_seed(seed)
-    shift = torch.stack([1 + torch.randperm(vertices - 1, generator=rng)[: length - 1]
-                         for _ in range(vertices)])  # fmt: skip
+    shift = torch.stack(
+        [1 + torch.randperm(vertices - 1, generator=rng)[: length - 1] for _ in range(vertices)]
+    )
     centre = torch.arange(vertices)[:, None]
     spirals = torch.cat([centre, (centre + shift) % vertices], dim=1)
     if padded:
@@ -206,8 +207,9 @@ def test_an_lstm_under_autocast_multiplies_in_bf16_and_remembers_in_float32():
         out = layer(features.bfloat16(), spirals)
     assert out.dtype == torch.float32 and not torch.equal(out, exact)
     torch.testing.assert_close(out, exact, rtol=0, atol=0.03)
-    grads = [torch.autograd.grad(x.square().sum(), [features, layer.hidden.weight])
-             for x in (out, exact)]  # fmt: skip
+    grads = [
+        torch.autograd.grad(x.square().sum(), [features, layer.hidden.weight]) for x in (out, exact)
+    ]
     for a, b in zip(*grads, strict=True):
         assert a.dtype == torch.float32
         torch.testing.assert_close(a, b, rtol=0, atol=0.03 * float(b.abs().max()))

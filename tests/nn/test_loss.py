@@ -4,15 +4,17 @@ import pytest
 import torch
 from torch.nn import functional as F
 
-from src.nn import loss as module
-from src.nn.loss import linear_cross_entropy, predict
+from meshspiral.nn import loss as module
+from meshspiral.nn.loss import linear_cross_entropy, predict
 
 
 @pytest.fixture
 def layer():
     torch.manual_seed(0)
-    x, weight, bias = (torch.randn(*shape, dtype=torch.float64, requires_grad=True)
-                       for shape in ((23, 5), (17, 5), (17,)))  # fmt: skip
+    x, weight, bias = (
+        torch.randn(*shape, dtype=torch.float64, requires_grad=True)
+        for shape in ((23, 5), (17, 5), (17,))
+    )
     return x, weight, bias, torch.randint(0, 17, (23,))
 
 
@@ -23,8 +25,11 @@ def test_value_and_gradients_are_those_of_linear_and_cross_entropy(layer, rows, 
     loss = linear_cross_entropy(*layer)
     plain = F.cross_entropy(F.linear(x, weight, bias), labels)
     torch.testing.assert_close(loss, plain, rtol=0, atol=1e-12)
-    for a, b in zip(torch.autograd.grad(3 * loss, (x, weight, bias)),
-                    torch.autograd.grad(3 * plain, (x, weight, bias)), strict=True):  # fmt: skip
+    for a, b in zip(
+        torch.autograd.grad(3 * loss, (x, weight, bias)),
+        torch.autograd.grad(3 * plain, (x, weight, bias)),
+        strict=True,
+    ):
         torch.testing.assert_close(a, b, rtol=0, atol=1e-12)
 
 
@@ -49,8 +54,9 @@ def test_under_autocast_the_products_are_in_bf16_and_the_sums_are_not(layer):
     assert loss.dtype == torch.float32
     torch.testing.assert_close(loss, plain, rtol=2e-2, atol=0)
     assert loss != plain
-    for a, b in zip(torch.autograd.grad(loss, (x, weight)),
-                    torch.autograd.grad(plain, (x, weight)), strict=True):  # fmt: skip
+    for a, b in zip(
+        torch.autograd.grad(loss, (x, weight)), torch.autograd.grad(plain, (x, weight)), strict=True
+    ):
         assert a.dtype == torch.float32
         torch.testing.assert_close(a, b, rtol=0, atol=2e-2)
 

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from src.nn.networks import GCNN3, FCSNet, LSTMNet
+from meshspiral.nn.networks import GCNN3, FCSNet, LSTMNet
 from tests.nn.test_geodesic import as_resampling, patches
 
 
@@ -80,8 +80,9 @@ def test_metric_information_reaches_the_layers_it_should(name, place, layers, ba
     features, spirals, extra = batch
     net = make(name, metric=True, metric_layers=place)
     net(features, spirals, extra).sum().backward()
-    reached = [layer.metric is not None and bool(layer.metric.weight.grad.any())
-               for layer in net.layers]  # fmt: skip
+    reached = [
+        layer.metric is not None and bool(layer.metric.weight.grad.any()) for layer in net.layers
+    ]
     assert reached == [True] * layers + [False] * (3 - layers)
 
 

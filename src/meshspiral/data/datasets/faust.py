@@ -1,0 +1,99 @@
+"""FAUST's 100 registrations (Bogo et al. 2014), from the folder or straight from the zip."""
+
+from __future__ import annotations
+
+import re
+import zipfile
+from collections import defaultdict
+from collections.abc import Iterable
+from functools import cached_property
+from pathlib import Path, PurePosixPath
+
+from meshspiral.data.shapes import DataError, Shape, ShapeSet, registered_shape, subject_split
+from meshspiral.geometry.mesh import Mesh, parse_mesh, read_mesh
+
+NAMES = [f"tr_reg_{i:03d}" for i in range(100)]
+_REGISTRATION = re.compile(r"((?:[^/]+/)?training/registrations/)(tr_reg_\d{3})\.ply")
+_HELP = (
+    "FAUST's owners give it to whoever registers at https://faust-leaderboard.is.tuebingen.mpg.de "
+    "(see also http://faust.is.tue.mpg.de); then pass data.root=/path/to/MPI-FAUST or "
+    "data.root=/path/to/MPI-FAUST.zip. data=bodies_6890 has the same shape (100 meshes of 6890 "
+    "vertices, 10 people in 10 poses) and needs no registration."
+)
+
+
+class Faust(ShapeSet):
+    """The registrations tr_reg_000 .. tr_reg_099 of MPI-FAUST: 6890 vertices, one connectivity.
+
+    root: the extracted MPI-FAUST folder, a folder that contains it, or MPI-FAUST.zip, which is read
+    in place. Shape i shows subject i // 10 in pose i % 10. tr_reg_000 is the template, and a label
+    is a vertex number. Errors: DataError where the data are missing, incomplete or damaged, or a
+    mesh has not the template's number of vertices; MeshError where one cannot be used.
+    """
+
+    def __init__(self, root: str | Path | None) -> None:
+        if not root:
+            raise _unusable("data.root is not set")
+        self._root = Path(root).expanduser()
+        self._files = _registrations(self._root)
+        missing = [name for name in NAMES if name not in self._files]
+        if missing:
+            raise _unusable(
+                f"{self._root} lacks {len(missing)} of the {len(NAMES)} registrations, the first "
+                f"training/registrations/{missing[0]}.ply"
+            )
+        self.names = subject_split(NAMES)
+
+    @cached_property
+    def template(self) -> Mesh:
+        return self._read(NAMES[0])
+
+    def load(self, name: str) -> Shape:
+        if name not in NAMES:
+            raise DataError(f"no registration is called {name!r}: {NAMES[0]} .. {NAMES[-1]}")
+        return registered_shape(self._read(name), self.template)
+
+    def _read(self, name: str) -> Mesh:
+        file = self._files[name]
+        if self._root.is_dir():
+            return read_mesh(self._root / file)
+        try:
+            with zipfile.ZipFile(self._root) as archive:
+                data = archive.read(file)
+        except Exception as error:  # zlib, lzma, CRC, encryption: whatever a damaged archive raises
+            raise _unusable(f"{self._root}: {file} cannot be unpacked ({error})") from error
+        return parse_mesh(data, ".ply", f"{self._root}:{file}")
+
+
+def _registrations(root: Path) -> dict[str, str]:
+    """For each registration found its path inside root, a folder or an archive."""
+    if root.is_dir():
+        patterns = ("training/registrations/*.ply", "*/training/registrations/*.ply")
+        paths = [path for pattern in patterns for path in root.glob(pattern)]
+        return _most_complete(path.relative_to(root).as_posix() for path in paths)
+    try:
+        with zipfile.ZipFile(root) as archive:
+            names = archive.namelist()
+    except FileNotFoundError as error:
+        raise _unusable(f"{root} does not exist") from error
+    except zipfile.BadZipFile as error:
+        raise _unusable(f"{root} is neither a folder nor an intact zip ({error})") from error
+    except OSError as error:
+        raise _unusable(f"{root} cannot be read ({error.strerror or error})") from error
+    for name in names:  # none is ever written, but such an archive is not what it says
+        if name.startswith("/") or ".." in PurePosixPath(name.replace("\\", "/")).parts:
+            raise _unusable(f"{root} holds {name!r}, which leads out of it")
+    return _most_complete(names)
+
+
+def _most_complete(paths: Iterable[str]) -> dict[str, str]:
+    """The registrations of one folder: two copies, one of them partial, are never mixed."""
+    folders: dict[str, dict[str, str]] = defaultdict(dict)
+    for path in sorted(paths):
+        if match := _REGISTRATION.fullmatch(path):
+            folders[match[1]][match[2]] = path
+    return max(folders.values(), key=lambda files: len(files.keys() & set(NAMES)), default={})
+
+
+def _unusable(found: str) -> DataError:
+    return DataError(f"FAUST (100 registered scans of people, Bogo et al. 2014): {found}. {_HELP}")

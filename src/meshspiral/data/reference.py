@@ -1,0 +1,71 @@
+"""Geodesic distances on the template: what an error is measured with."""
+
+from __future__ import annotations
+
+import sys
+from functools import partial
+from importlib.metadata import version
+
+import numpy as np
+from tqdm import tqdm
+
+from meshspiral.data.cache import Store, code_version, digest
+from meshspiral.geometry import geodesics, mesh
+from meshspiral.geometry.mesh import Mesh
+
+BLOCK = 256  # rows kept in one file
+IN_MEMORY = 2**30  # bytes of rows; all of them up to 16,000 vertices
+
+
+class ReferenceDistances:
+    """Distances between template vertices over sqrt(template area), computed as they are needed.
+
+    Rows are computed in blocks of neighbouring vertex numbers and kept on disk and in memory.
+    diameter: the template's geodesic diameter, over sqrt(area) too, so that an error over the
+    diameter is an error over sqrt(area) divided by it. place: float64 [K, 3], the template's
+    vertices over sqrt(area). Between two components of the template
+    there is no path; such a distance counts as the diameter.
+    """
+
+    def __init__(self, template: Mesh, store: Store):
+        self.template, self._store = template, store
+        self._blocks: dict[int, np.ndarray] = {}
+        self._solver: geodesics.GeodesicSolver | None = None
+        versions = code_version(geodesics, mesh, sys.modules[__name__]), version("potpourri3d")
+        self._key = digest(template.vertices, template.faces, *versions)
+        self._unit = np.sqrt(template.area)
+        self.place = template.vertices / self._unit
+        kept = store.get("diameter", self._key, self._compute_diameter)
+        self.diameter = float(kept["diameter"])
+
+    def __call__(self, sources: np.ndarray, targets: np.ndarray) -> np.ndarray:
+        """float64 [K]: the distance from sources[k] to targets[k], both int64 [K]."""
+        distances = np.zeros(len(sources))
+        apart = np.flatnonzero(sources != targets)
+        blocks = sources[apart] // BLOCK
+        progress = tqdm(
+            np.unique(blocks), desc="Geodesic distances", unit="block", leave=False, delay=1.0
+        )
+        for block in progress:
+            pairs = apart[blocks == block]
+            distances[pairs] = self._block(int(block))[sources[pairs] % BLOCK, targets[pairs]]
+        return distances
+
+    def _block(self, block: int) -> np.ndarray:
+        if block not in self._blocks:
+            key, compute = f"{self._key}-{block}", partial(self._compute, block)
+            rows = self._store.get("distances", key, compute)["distances"]
+            if (len(self._blocks) + 1) * rows.nbytes > IN_MEMORY and self._blocks:
+                del self._blocks[next(iter(self._blocks))]
+            self._blocks[block] = rows
+        return self._blocks[block]
+
+    def _compute(self, block: int) -> dict[str, np.ndarray]:
+        self._solver = self._solver or geodesics.GeodesicSolver(self.template)
+        last = min((block + 1) * BLOCK, len(self.template.vertices))
+        rows = np.stack([self._solver.row(v) for v in range(block * BLOCK, last)]) / self._unit
+        rows[~np.isfinite(rows)] = self.diameter
+        return {"distances": rows.astype(np.float32)}
+
+    def _compute_diameter(self) -> dict[str, np.ndarray]:
+        return {"diameter": np.array(geodesics.diameter(self.template) / self._unit)}

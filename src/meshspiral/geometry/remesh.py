@@ -1,0 +1,324 @@
+"""Other tessellations of a surface, and where their vertices came from.
+
+The remeshing is PyMeshLab's: isotropic remeshing (Hoppe et al. 1993 in the explicit form of Botsch,
+Kobbelt 2004), simplification by quadrics (Garland, Heckbert 1997), marching cubes (Lorensen, Cline
+1987). Plain isotropic remeshing keeps much of the old tessellation. So the vertices are numbered at
+random first, on which the order of its steps depends, and then each policy remeshes finely before
+it comes to the resolution wanted.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+import trimesh
+from scipy.spatial import cKDTree
+
+from meshspiral.geometry.mesh import Mesh, MeshError
+
+NEAREST = 16  # faces tried first for a closest point
+FACING = 0.2  # least cosine between the normals of a vertex and of the face it is on
+
+
+class Remeshed(NamedTuple):
+    """A mesh, and for each of its vertices a point on the source.
+
+    faces: int64 [V], a face of the source. weights: float64 [V, 3], barycentric coordinates in it.
+    distance: float64 [V], from the vertex to that point.
+    """
+
+    mesh: Mesh
+    faces: np.ndarray
+    weights: np.ndarray
+    distance: np.ndarray
+
+
+def remesh(mesh: Mesh, vertices: int, policy: str = "isotropic", seed: int = 0) -> Remeshed:
+    """The surface with other vertices and faces, in random order.
+
+    vertices: how many; "marching" and open surfaces may have some per cent fewer. policy: one of
+    POLICIES: isotropic: edges of one length; adaptive: shorter where the surface is curved, see
+    `bending`; refined: shorter around four random places; simplified: a fine mesh reduced by
+    quadrics, its triangles stretched along the flat directions; marching: marching cubes, with
+    slivers, and thin parts lost; mixed: one of these, drawn by the seed. Errors: MeshError for
+    fewer than 12 vertices, for another policy, for a mesh that PyMeshLab can't remesh to that
+    size, or without PyMeshLab.
+    """
+    if policy not in POLICIES:
+        raise MeshError(f"policy must be one of {', '.join(POLICIES)}; got {policy!r}")
+    if vertices < 12:
+        raise MeshError(f"a mesh of {vertices} vertices is no surface to learn on; at least 12")
+    rng = np.random.default_rng(seed)
+    if policy == "mixed":
+        policy = str(rng.choice([p for p in POLICIES if p != "mixed"]))
+    tool = Tool(mesh, vertices, rng)
+    for _ in range(6):
+        POLICIES[policy](tool, rng)
+        count = tool.count
+        if count >= (0.95 if policy == "marching" else 0.9 if tool.border() else 1) * vertices:
+            break
+        tool.edge *= 0.97 * np.sqrt(count / vertices)
+    else:
+        raise MeshError(
+            f"{mesh.name}: could not be remeshed to {vertices} vertices, but to {count}"
+        )
+    if count > vertices:
+        tool.simplify()
+    points, faces = tool.result()
+    result = Mesh(points, faces, mesh.name).renumbered(rng.permutation(len(points)))
+    return Remeshed(result, *closest_points(mesh, result.vertices, result.vertex_normals))
+
+
+def closest_points(
+    mesh: Mesh, points: np.ndarray, normals: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The nearest point of the surface whose normal agrees: face int64 [Q], barycentric coordinates
+    float64 [Q, 3], distance float64 [Q].
+
+    points, normals: float [Q, 3]. Where two parts of a surface touch, the nearer one may be the
+    wrong one; it faces the other way. Faces whose normal is off by more than arccos(0.2) are not
+    considered, unless there are no others.
+    """
+    triangles = mesh.vertices[mesh.faces]
+    centres = triangles.mean(axis=1)
+    reach = np.linalg.norm(triangles - centres[:, None], axis=2).max(axis=1)
+    directions = mesh.face_normals / np.maximum(
+        np.linalg.norm(mesh.face_normals, axis=1, keepdims=True), 1e-300
+    )
+    tree = cKDTree(centres)
+    count = len(points)
+    face, place = np.zeros(count, dtype=np.int64), np.zeros((count, 3))
+    distance = np.full(count, np.inf)
+
+    def consider(queries: np.ndarray, faces: np.ndarray, facing: float = FACING) -> None:
+        """Of pairs [P] of a query and a face, ascending in the queries: keep what is nearer."""
+        # a vertex without a normal, NaN, agrees with all
+        agrees = ~(np.einsum("px,px->p", normals[queries], directions[faces]) < facing)
+        least = np.linalg.norm(points[queries] - centres[faces], axis=1) - reach[faces]
+        worth = agrees & (least < distance[queries])
+        queries, faces = queries[worth], faces[worth]
+        found = trimesh.triangles.closest_point(triangles[faces], points[queries])
+        far = np.linalg.norm(found - points[queries], axis=1)
+        order = np.lexsort((far, queries))
+        first = order[np.unique(queries[order], return_index=True)[1]]
+        nearer = first[far[first] < distance[queries[first]]]
+        changed = queries[nearer]
+        face[changed], place[changed], distance[changed] = faces[nearer], found[nearer], far[nearer]
+
+    tried = min(NEAREST, len(centres))
+    apart, near = (x.reshape(count, tried) for x in tree.query(points, k=tried))
+    consider(np.repeat(np.arange(count), tried), near.ravel())
+    # a face not tried is farther than its centre less its reach
+    unsure = np.flatnonzero((distance > apart[:, -1] - reach.max()) & np.isfinite(distance))
+    others = tree.query_ball_point(points[unsure], distance[unsure] + reach.max())
+    if len(unsure):
+        consider(np.repeat(unsure, [len(o) for o in others]), np.concatenate(others).astype(int))
+    for facing in (FACING, -np.inf):
+        for query in np.flatnonzero(np.isinf(distance)):
+            consider(np.full(len(centres), query), np.arange(len(centres)), facing)
+    weights = trimesh.triangles.points_to_barycentric(triangles[face], place)
+    weights = np.clip(np.nan_to_num(weights, nan=1 / 3), 0, None)
+    return face, weights / weights.sum(axis=1, keepdims=True), distance
+
+
+def bending(mesh: Mesh, radius: float) -> np.ndarray:
+    """How much the surface curves around each vertex, float64 [V] in 0..1: one less the length of
+    the mean of the normals within the radius, or two of the mesh's own edges if that is more.
+
+    On a sphere of radius R it is (radius / 2R)^2, nearly. Normals that face the other way are of
+    another sheet, and do not count.
+    """
+    radius = max(radius, 2 * mean_edge(mesh.area, len(mesh.vertices)))
+    normals = np.nan_to_num(mesh.vertex_normals)
+    one, other = cKDTree(mesh.vertices).query_pairs(radius, output_type="ndarray").T
+    agree = np.einsum("px,px->p", normals[one], normals[other]) > 0
+    one, other = one[agree], other[agree]
+    total, count = normals.copy(), np.ones(len(normals))
+    for vertex, near in ((one, other), (other, one)):
+        np.add.at(total, vertex, normals[near])
+        np.add.at(count, vertex, 1)
+    return 1 - np.linalg.norm(total, axis=1) / count
+
+
+def mean_edge(area: float, vertices: int) -> float:
+    """Of a mesh of equilateral triangles."""
+    return float(np.sqrt(2 / np.sqrt(3) * area / vertices))
+
+
+class Tool:
+    """One mesh in PyMeshLab. Every parameter is given each time: it remembers those of other calls.
+
+    edge: the length of the edges of an isotropic mesh with as many vertices as wanted.
+    """
+
+    def __init__(self, mesh: Mesh, vertices: int, rng: np.random.Generator):
+        try:
+            import pymeshlab
+        except ImportError as error:
+            raise MeshError("remeshing needs PyMeshLab: pip install -e '.[remesh]'") from error
+        self._lab, self.source, self.vertices, self._rng = pymeshlab, mesh, vertices, rng
+        self.area = mesh.area
+        self.edge = mean_edge(self.area, vertices)
+        self.reset()
+
+    def reset(self) -> None:
+        """The source again, numbered at random."""
+        mesh = self.source.renumbered(self._rng.permutation(len(self.source.vertices)))
+        faces = self._rng.permutation(mesh.faces)
+        self._set = self._lab.MeshSet()
+        self._set.add_mesh(self._lab.Mesh(mesh.vertices, faces))
+
+    @property
+    def count(self) -> int:
+        return self._set.current_mesh().vertex_number()
+
+    def result(self) -> tuple[np.ndarray, np.ndarray]:
+        self._set.meshing_remove_unreferenced_vertices()
+        mesh = self._set.current_mesh()
+        return mesh.vertex_matrix(), mesh.face_matrix()
+
+    def border(self) -> int:
+        """The number of edges with one face."""
+        edges = trimesh.geometry.faces_to_edges(self._set.current_mesh().face_matrix())
+        return len(trimesh.grouping.group_rows(np.sort(edges, axis=1), require_count=1))
+
+    def isotropic(self, edge: float, times: int, selected=False) -> None:
+        self._set.meshing_isotropic_explicit_remeshing(
+            iterations=times,
+            adaptive=False,
+            selectedonly=selected,
+            targetlen=self._lab.PureValue(edge),
+            featuredeg=180.0,
+            checksurfdist=True,
+            maxsurfdist=self._lab.PureValue(0.1 * self.edge),
+            splitflag=True,
+            collapseflag=True,
+            swapflag=True,
+            smoothflag=True,
+            reprojectflag=True,
+        )
+
+    def simplify(self, selected=False, placement=False) -> None:
+        """To the number of vertices wanted; selected: there alone, if that suffices."""
+        mesh = self._set.current_mesh()
+        faces = mesh.selected_face_number() if selected else mesh.face_number()
+        fewer = 2 * (self.count - self.vertices)  # a collapsed edge has two faces, at a border one
+        fewer -= int(self.border() * (1 - np.sqrt(self.vertices / self.count)))
+        if not 0 < fewer < faces:
+            return
+        self._set.meshing_decimation_quadric_edge_collapse(
+            targetfacenum=faces - fewer,
+            targetperc=0.0,
+            qualitythr=0.1,
+            preserveboundary=False,
+            boundaryweight=1.0,
+            preservenormal=True,
+            preservetopology=True,
+            optimalplacement=placement,
+            planarquadric=False,
+            planarweight=0.001,
+            qualityweight=False,
+            autoclean=True,
+            selected=selected,
+        )
+
+    def select_bent(self, bent: np.ndarray, share: float) -> None:
+        """The most curved faces, up to that share of the area. bent: of the source's vertices."""
+        points, faces = self.result()
+        bent = bent[cKDTree(self.source.vertices).query(points)[1]]
+        order = np.argsort(-bent[faces].mean(axis=1))
+        area = np.cumsum(trimesh.triangles.area(points[faces[order]]))
+        last = order[np.searchsorted(area, share * area[-1])]
+        self._set = self._lab.MeshSet()
+        self._set.add_mesh(self._lab.Mesh(points, faces, v_scalar_array=bent))
+        least = bent[faces[last]].mean()
+        self._set.compute_selection_by_condition_per_face(condselect=f"(q0+q1+q2)/3 > {least}")
+
+    def select_around(self, centres: np.ndarray, radius: float) -> None:
+        near = " || ".join(
+            f"(((x0+x1+x2)/3-({x}))^2+((y0+y1+y2)/3-({y}))^2+((z0+z1+z2)/3-({z}))^2 < {radius**2})"
+            for x, y, z in centres.tolist()
+        )
+        self._set.compute_selection_by_condition_per_face(condselect=near)
+
+    def simplify_the_rest(self) -> None:
+        self._set.apply_selection_inverse(invfaces=True, invverts=False)
+        self.simplify(selected=True)
+
+    def marching_cubes(self, cell: float) -> None:
+        self.reset()
+        self._set.generate_resampled_uniform_mesh(
+            cellsize=self._lab.PureValue(cell),
+            offset=self._lab.PureValue(0.0),
+            mergeclosevert=False,
+            discretize=False,
+            multisample=False,
+            absdist=False,
+        )
+        pieces = trimesh.Trimesh(*self.result(), process=False).split(only_watertight=False)
+        if not len(pieces):
+            raise MeshError(f"{self.source.name}: too thin for marching cubes of that size")
+        largest = max(pieces, key=lambda piece: len(piece.vertices))
+        self._set = self._lab.MeshSet()
+        self._set.add_mesh(self._lab.Mesh(largest.vertices, largest.faces))
+
+
+def _finely(tool: Tool, rng: np.random.Generator) -> None:
+    tool.reset()
+    tool.isotropic(rng.uniform(0.3, 0.4) * tool.edge, 4)
+
+
+def _isotropic(tool: Tool, rng: np.random.Generator) -> None:
+    _finely(tool, rng)
+    tool.isotropic(tool.edge, 8)
+
+
+def _adaptive(tool: Tool, rng: np.random.Generator) -> None:
+    _finely(tool, rng)
+    tool.isotropic(1.35 * tool.edge, 8)
+    bent = bending(tool.source, tool.edge)
+    for share, length in ((0.35, 0.85), (0.12, 0.55)):
+        tool.select_bent(bent, share)
+        tool.isotropic(length * tool.edge, 4, selected=True)
+    tool.select_bent(bent, 0.35)
+    tool.simplify_the_rest()
+
+
+def _refined(tool: Tool, rng: np.random.Generator) -> None:
+    _finely(tool, rng)
+    tool.isotropic(1.2 * tool.edge, 8)
+    vertices, _ = tool.result()
+    centres = vertices[rng.integers(len(vertices), size=4)]
+    radius = 0.12 * np.sqrt(tool.area)
+    tool.select_around(centres, radius)
+    tool.isotropic(0.5 * tool.edge, 4, selected=True)
+    tool.select_around(centres, radius)
+    tool.simplify_the_rest()  # what is refined stays so
+
+
+def _simplified(tool: Tool, rng: np.random.Generator) -> None:
+    _finely(tool, rng)
+    tool.isotropic(rng.uniform(0.8, 1.2) * tool.edge, 3)  # the old vertices go
+    tool.isotropic(rng.uniform(0.35, 0.45) * tool.edge, 3)
+    tool.simplify(placement=True)
+
+
+def _marching(tool: Tool, rng: np.random.Generator) -> None:
+    cell = 1.1 * tool.edge
+    for _ in range(4):
+        tool.marching_cubes(cell * rng.uniform(0.99, 1.01))
+        share = tool.count / tool.vertices
+        if 1 <= share < 1.05:
+            return
+        cell *= np.sqrt(share) * 0.99
+
+
+POLICIES = {
+    "isotropic": _isotropic,
+    "adaptive": _adaptive,
+    "refined": _refined,
+    "simplified": _simplified,
+    "marching": _marching,
+    "mixed": None,
+}

@@ -1,0 +1,277 @@
+"""What happens beside training: a bar, checkpoints, an orderly stop."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import os
+import signal
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import lightning as L
+import torch
+from lightning.pytorch.callbacks import Callback, ModelCheckpoint, ProgressBar
+from lightning.pytorch.plugins.io import TorchCheckpointIO
+from tqdm import tqdm
+
+from meshspiral.evaluation.metrics import THRESHOLDS
+from meshspiral.experiment.runs import LAST, Stopped
+from meshspiral.viz.plots import curve_figure, sketch_figure, template_colors
+from meshspiral.viz.render import upright
+
+
+class WholeFiles(TorchCheckpointIO):
+    """Checkpoints that appear whole or not at all, also when the machine stops or the disk fills.
+
+    The previous checkpoint stays until the next one is complete.
+    """
+
+    def save_checkpoint(self, checkpoint: dict[str, Any], path: Any, storage_options=None) -> None:
+        path = Path(path)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        temporary = path.with_name(f"{path.name}.tmp")
+        try:
+            whole = io.BytesIO()  # torch.save to a full disk would not say that it is full
+            torch.save(checkpoint, whole)
+            with open(temporary, "wb") as file:
+                file.write(whole.getbuffer())
+                file.flush()
+                os.fsync(file.fileno())
+            os.replace(temporary, path)
+        except OSError as error:
+            with contextlib.suppress(OSError):
+                temporary.unlink()
+            reason = error.strerror or error
+            raise OSError(f"cannot write the checkpoint {path} ({reason})") from error
+
+
+class Checkpoint(ModelCheckpoint):
+    """Lightning's, but a run folder that was moved keeps its best checkpoint when it goes on."""
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        here = str(self.dirpath)
+        moved = {
+            name: str(Path(here, Path(state[name]).name))
+            for name in ("best_model_path", "kth_best_model_path", "last_model_path")
+            if state.get(name)
+        }
+        best = {
+            str(Path(here, Path(path).name)): score
+            for path, score in state.get("best_k_models", {}).items()
+        }
+        super().load_state_dict({**state, **moved, "dirpath": here, "best_k_models": best})
+
+
+class Bar(ProgressBar):
+    """One bar for the whole training, with the time left and the latest figures.
+
+    Validation and test show one of their own where they take longer than a second.
+    """
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._bar: tqdm | None = None
+
+    def disable(self) -> None:
+        self._enabled = False
+
+    def enable(self) -> None:
+        self._enabled = True
+
+    def on_train_start(self, trainer: L.Trainer, module: L.LightningModule) -> None:
+        total = trainer.max_epochs * trainer.num_training_batches
+        # in a log file every update is a line
+        every = 0.1 if sys.stderr.isatty() else 10.0
+        self._bar = tqdm(
+            total=total,
+            initial=trainer.global_step,
+            desc="Training",
+            unit="step",
+            mininterval=every,
+            disable=not trainer.is_global_zero,
+            dynamic_ncols=True,
+        )
+
+    def on_train_batch_end(self, trainer, module, outputs, batch, batch_idx) -> None:
+        self._bar.update()
+
+    def on_validation_end(self, trainer: L.Trainer, module: L.LightningModule) -> None:
+        self._evaluation.close()
+        values = trainer.callback_metrics
+        if self._bar is not None and "val/exact_match" in values:
+            self._bar.set_postfix_str(
+                f"epoch {trainer.current_epoch + 1}/{trainer.max_epochs}, "
+                f"validation: {100 * values['val/exact_match']:.1f} % exact, "
+                f"error {values['val/geodesic_error']:.4f}",
+                refresh=False,
+            )
+
+    def on_train_end(self, trainer: L.Trainer, module: L.LightningModule) -> None:
+        self._close()
+
+    def on_validation_start(self, trainer: L.Trainer, module: L.LightningModule) -> None:
+        self._begin("Validation", trainer.num_val_batches)
+
+    def on_test_start(self, trainer: L.Trainer, module: L.LightningModule) -> None:
+        self._begin("Test", trainer.num_test_batches)
+
+    def _begin(self, what: str, batches: list[int]) -> None:
+        self._evaluation = tqdm(
+            total=sum(batches),
+            desc=what,
+            unit="mesh",
+            leave=False,
+            delay=1.0,
+            disable=not self.trainer.is_global_zero,
+        )
+
+    def on_validation_batch_end(self, *_) -> None:
+        self._evaluation.update()
+
+    def on_test_batch_end(self, *_) -> None:
+        self._evaluation.update()
+
+    def on_test_end(self, trainer: L.Trainer, module: L.LightningModule) -> None:
+        self._evaluation.close()
+
+    def on_exception(self, trainer, module, exception) -> None:
+        self._close()
+
+    def _close(self) -> None:
+        if self._bar is not None:
+            self._bar.close()
+            self._bar = None
+
+
+class Speed(Callback):
+    """Logs training steps per second, validation left out, and keeps the time of training.
+
+    seconds: from the first step to now, validation included, in all parts of a run together.
+    """
+
+    def __init__(self) -> None:
+        self._earlier = 0.0
+        self._began: float | None = None
+
+    @property
+    def seconds(self) -> float:
+        return self._earlier + (time.perf_counter() - self._began if self._began else 0.0)
+
+    def on_train_start(self, trainer: L.Trainer, module: L.LightningModule) -> None:
+        self._began = time.perf_counter()
+        self._steps, self._busy = 0, 0.0
+
+    def on_train_end(self, trainer: L.Trainer, module: L.LightningModule) -> None:
+        self._earlier, self._began = self.seconds, None
+
+    def on_train_batch_start(self, trainer, module, batch, batch_idx) -> None:
+        self._started = time.perf_counter()
+
+    def on_train_batch_end(self, trainer, module, outputs, batch, batch_idx) -> None:
+        self._steps += 1
+        self._busy += time.perf_counter() - self._started
+
+    def on_train_epoch_end(self, trainer: L.Trainer, module: L.LightningModule) -> None:
+        if self._busy > 0:
+            speed = self._steps / self._busy
+            module.log("train/steps_per_second", speed, batch_size=1, sync_dist=True)
+        self._steps, self._busy = 0, 0.0
+
+    def state_dict(self) -> dict[str, float]:
+        return {"seconds": self.seconds}
+
+    def load_state_dict(self, state: dict[str, float]) -> None:
+        self._earlier = state["seconds"]
+
+
+class Looks(Callback):
+    """Into TensorBoard: the curve of validation, and a validation shape, each vertex in the colour
+    of its counterpart; after the first validation, and then as often as 1 % of the time allows.
+    At the end the curve of the test."""
+
+    SHARE = 0.01
+
+    def __init__(self) -> None:
+        self._spent, self._began = 0.0, 0.0
+
+    def on_train_start(self, trainer: L.Trainer, module: L.LightningModule) -> None:
+        self._began = time.perf_counter()
+
+    def on_validation_end(self, trainer: L.Trainer, module: L.LightningModule) -> None:
+        now = time.perf_counter()
+        if trainer.state.fn != "fit" or self._spent > self.SHARE * (now - self._began):
+            return
+        self._curve(trainer, module, "val")
+        if trainer.is_global_zero and trainer.logger is not None:
+            data = trainer.datamodule
+            mesh = data.shape(data.shapes.names["val"][0]).mesh
+            colors = template_colors(data.shapes.template)[module.results["val"][0].predicted]
+            figure = sketch_figure(upright(mesh.vertices, data.shapes.up), mesh.faces, colors)
+            trainer.logger.experiment.add_figure("val/shape", figure, trainer.current_epoch)
+        self._spent += time.perf_counter() - now
+
+    def on_test_end(self, trainer: L.Trainer, module: L.LightningModule) -> None:
+        self._curve(trainer, module, "test")
+
+    def _curve(self, trainer: L.Trainer, module: L.LightningModule, split: str) -> None:
+        if trainer.is_global_zero and trainer.logger is not None:
+            figure = curve_figure({split: (THRESHOLDS, module.curves[split])})
+            trainer.logger.experiment.add_figure(f"{split}/curve", figure, trainer.current_epoch)
+
+
+class OrderlyStop(Callback):
+    """On Ctrl-C or SIGTERM: finish the step, save last.ckpt, and stop.
+
+    The same signal a second time stops at once; last.ckpt is then that of the last whole epoch.
+    """
+
+    def __init__(self, folder: Path):
+        self.folder = folder
+        self.signum: int | None = None
+        self._before: dict[int, Any] = {}
+
+    def on_train_start(self, trainer: L.Trainer, module: L.LightningModule) -> None:
+        for signum in (signal.SIGINT, signal.SIGTERM):
+            self._before[signum] = signal.signal(signum, self._note)
+
+    def _note(self, signum: int, frame: object) -> None:
+        if self.signum is not None:
+            raise Stopped(signum)
+        self.signum = signum
+        print("\nstopping after this step ...", file=sys.stderr)
+
+    def on_train_batch_start(self, trainer, module, batch, batch_idx) -> None:
+        # Between two steps, and not before the last of an epoch: there Lightning can't tell a
+        # finished epoch from an unfinished one. The start of an epoch is in last.ckpt already.
+        signum = self._heard(trainer)
+        if signum is None or 0 < batch_idx == trainer.num_training_batches - 1:
+            return
+        if batch_idx > 0 or trainer.global_step == 0:
+            trainer.save_checkpoint(self.folder / LAST)
+        raise Stopped(signum)
+
+    def _heard(self, trainer: L.Trainer) -> int | None:
+        """The signal that has come to this process, or to one of several: all stop at one step."""
+        if trainer.world_size == 1:
+            return self.signum
+        anywhere = trainer.strategy.reduce_boolean_decision(self.signum is not None, all=False)
+        if not anywhere:  # one that came since is for the next step: the others don't know of it
+            return None
+        return self.signum or signal.SIGTERM
+
+    def on_train_end(self, trainer: L.Trainer, module: L.LightningModule) -> None:
+        signum = self._heard(trainer)
+        self._restore()
+        if signum is not None:
+            raise Stopped(signum)
+
+    def teardown(self, trainer: L.Trainer, module: L.LightningModule, stage: str) -> None:
+        self._restore()
+
+    def _restore(self) -> None:
+        for signum, handler in self._before.items():
+            signal.signal(signum, handler)
+        self._before = {}

@@ -1,0 +1,208 @@
+"""Curves and pictures, by matplotlib. None belongs to a window system: `figure.savefig(path)`."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Mapping
+
+import numpy as np
+from matplotlib import colormaps, cycler, rc_context, rcParams
+from matplotlib.cm import ScalarMappable
+from matplotlib.collections import PolyCollection
+from matplotlib.colors import Normalize
+from matplotlib.figure import Figure
+
+from meshspiral.geometry.mesh import Mesh
+
+ERROR_LABEL = r"geodesic error / $\sqrt{\mathrm{area}}$"
+MOST_ERROR = 0.2  # where colours end, as in the paper
+ERROR_COLORS = colormaps["magma_r"]  # darker with every step, also in greyscale
+DPI = 160
+IN_A_CORNER = 8  # curves whose names leave room for the curves
+
+
+def curve_figure(curves: Mapping[str, tuple[np.ndarray, np.ndarray]]) -> Figure:
+    """The share of correct matches over the geodesic error (Kim et al. 2011).
+
+    curves: by name, thresholds [T] over sqrt(area), and shares in 0..1: [T], or [R, T] of several
+    runs: their mean, and a band from the least to the most.
+    """
+    many = len(curves) > IN_A_CORNER
+    size = (7.4, max(3.6, 0.19 * len(curves) + 0.2)) if many else (4.8, 3.6)
+    figure = Figure(figsize=size, layout="constrained")
+    axes = figure.add_subplot()
+    axes.set_prop_cycle(cycler(linestyle=("-", "--", ":", "-.")) * rcParams["axes.prop_cycle"])
+    for name, (thresholds, shares) in curves.items():
+        several = 100 * np.atleast_2d(shares)
+        [line] = axes.plot(thresholds, several.mean(axis=0), label=name, linewidth=1.6)
+        if len(several) > 1:
+            axes.fill_between(
+                thresholds,
+                several.min(axis=0),
+                several.max(axis=0),
+                alpha=0.25,
+                color=line.get_color(),
+                linewidth=0,
+            )
+    axes.set(
+        xlabel=ERROR_LABEL, ylabel="correct matches (%)", xlim=(0, thresholds[-1]), ylim=(0, 100)
+    )
+    axes.grid(alpha=0.3)
+    if many:
+        figure.legend(loc="outside right upper", fontsize="small")
+    else:
+        axes.legend(loc="lower right", fontsize="small")
+    return figure
+
+
+def all_curves_figure(thresholds: np.ndarray, shares: np.ndarray) -> Figure:
+    """Every curve of [R, T] in one figure, and within it the same in an enlargement of their
+    spread about the mean, in points."""
+    figure = Figure(figsize=(4.8, 3.6), layout="constrained")
+    axes = figure.add_subplot()
+    axes.plot(thresholds, 100 * shares.T, color="C0", alpha=0.15, linewidth=0.8)
+    axes.set(
+        xlabel=ERROR_LABEL,
+        ylabel="correct matches (%)",
+        xlim=(0, thresholds[-1]),
+        ylim=(0, 100),
+        title=f"{len(shares)} runs, each with other spirals",
+    )
+    axes.grid(alpha=0.3)
+    inset = axes.inset_axes((0.45, 0.15, 0.5, 0.4))
+    inset.plot(thresholds, 100 * (shares - shares.mean(axis=0)).T, color="C0", alpha=0.15, lw=0.8)
+    inset.set_title("from their mean, in points", fontsize="small")
+    inset.set_xlim(0, thresholds[-1])
+    inset.tick_params(labelsize="small")
+    inset.grid(alpha=0.3)
+    return figure
+
+
+def encoded(figure: Figure, kind: str) -> bytes:
+    """The figure as a "png", "pdf" or "svg" file: the same bytes for the same figure."""
+    when = {"pdf": "CreationDate", "svg": "Date"}.get(kind)
+    buffer = io.BytesIO()
+    with rc_context({"svg.hashsalt": "figure"}):
+        figure.savefig(buffer, format=kind, dpi=DPI, metadata={when: None} if when else None)
+    return buffer.getvalue()
+
+
+def growth_figure(series: list[dict]) -> Figure:
+    """Seconds and megabytes of a pass over its sizes, both axes logarithmic.
+
+    series: as `meshspiral.benchmarking.scaling.growth` gives them. Dashed: what is proportional to the size.
+    """
+    overs, units = list(dict.fromkeys(row["over"] for row in series)), ("seconds", "MB")
+    figure = Figure(figsize=(3.4 * len(overs), 6.2), layout="constrained")
+    axes = figure.subplots(2, len(overs), squeeze=False)
+    for column, over in enumerate(overs):
+        for unit, ax in zip(units, axes[:, column], strict=True):
+            for row in series:
+                if row["over"] == over and None not in row[unit]:
+                    label = f"{row['what']}, {row[f'exponent of {unit}']:.2f}"
+                    [line] = ax.loglog(row["sizes"], row[unit], "o-", ms=3, lw=1.4, label=label)
+                    end = row[unit][-1] / row["sizes"][-1]
+                    ax.loglog(
+                        row["sizes"],
+                        [end * size for size in row["sizes"]],
+                        "--",
+                        lw=0.8,
+                        color=line.get_color(),
+                    )
+            sizes = sorted({size for row in series if row["over"] == over for size in row["sizes"]})
+            names = [f"{size / 1000:g} k" if size >= 1000 else str(size) for size in sizes]
+            ax.minorticks_off()
+            ax.set_xticks(sizes, names, fontsize="small")
+            ax.set(xlabel=over, ylabel=unit)
+            ax.grid(alpha=0.3)
+            ax.legend(
+                fontsize="small",
+                title="exponent",
+                title_fontsize="small",
+                ncols=2,
+                loc="lower center",
+                bbox_to_anchor=(0.5, 1),
+            )
+    return figure
+
+
+def template_colors(template: Mesh) -> np.ndarray:
+    """float [K, 3] in 0..1: a colour for each template vertex, from its place in the bounding box.
+
+    Equal colours on two shapes mean: the same place of the template.
+    """
+    return place_colors(template, template.vertices)
+
+
+def place_colors(template: Mesh, points: np.ndarray) -> np.ndarray:
+    """The same for points [V, 3] on the template; grey where they are NaN."""
+    low, high = template.vertices.min(axis=0), template.vertices.max(axis=0)
+    colors = 0.1 + 0.9 * (points - low) / np.maximum(high - low, 1e-12)
+    return np.where(np.isnan(colors), 0.6, colors.clip(0, 1))
+
+
+def error_colors(errors: np.ndarray) -> np.ndarray:
+    """float [V, 3] in 0..1: from pale, right, to dark, an error of 0.2 sqrt(area) and more."""
+    return ERROR_COLORS(np.asarray(errors) / MOST_ERROR)[:, :3]
+
+
+def confidence_colors(confidence: np.ndarray) -> np.ndarray:
+    """float [V, 3] in 0..1: from dark, a confidence of 0, to pale, 1."""
+    return ERROR_COLORS(1 - np.asarray(confidence))[:, :3]
+
+
+def picture_figure(
+    images: list[np.ndarray], middles: np.ndarray, captions: list[str], bar: str | None = None
+) -> Figure:
+    """Views of a row of meshes, one below the other, with captions, and the colours' meaning.
+
+    images, middles: a `meshspiral.viz.render.Picture`. bar: what the colours show, "error" or "confidence".
+    """
+    height, width = images[0].shape[:2]
+    inches = width / DPI
+    margin = 0.9 if bar else 0.0
+    figure = Figure(figsize=(inches + margin, (height / DPI) * len(images) + 0.25))
+    figure.set_dpi(DPI)
+    tall = figure.get_figheight()
+    share = height / DPI / tall
+    for row, image in enumerate(images):
+        axes = figure.add_axes((0, 1 - (row + 1) * share, inches / (inches + margin), share))
+        axes.imshow(image)
+        axes.axis("off")
+    for middle, caption in zip(middles, captions, strict=True):
+        figure.text(
+            middle * inches / (inches + margin), 0.08 / tall, caption, ha="center", fontsize=8
+        )
+    if bar:
+        axes = figure.add_axes((inches / (inches + margin), 0.2, 0.12 / (inches + margin), 0.6))
+        if bar == "error":
+            scale = ScalarMappable(Normalize(0, MOST_ERROR), ERROR_COLORS)
+            figure.colorbar(scale, cax=axes, extend="max", label=ERROR_LABEL)
+        else:
+            scale = ScalarMappable(Normalize(0, 1), ERROR_COLORS.reversed())
+            figure.colorbar(scale, cax=axes, label=bar)
+    return figure
+
+
+def sketch_figure(points: np.ndarray, faces: np.ndarray, colors: np.ndarray) -> Figure:
+    """A mesh as seen from +z, y up, drawn face by face: rough, in a tenth of a second.
+
+    points: float [V, 3]. colors: float [V, 3] in 0..1.
+    """
+    corners = points[faces]
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    facing = normals[:, 2] / np.maximum(np.linalg.norm(normals, axis=1), 1e-300)
+    seen = np.flatnonzero(facing > 0)
+    seen = seen[np.argsort(corners[seen, :, 2].mean(axis=1))]
+    shade = 0.35 + 0.65 * facing[seen, None]
+    size = np.ptp(points, axis=0)
+    figure = Figure(figsize=(5 * min(max(0.2, size[0] / max(size[1], 1e-300)), 5), 5))
+    axes = figure.add_axes((0, 0, 1, 1))
+    paint = shade * colors[faces[seen]].mean(axis=1)
+    axes.add_collection(
+        PolyCollection(corners[seen, :, :2], facecolors=paint, edgecolors=paint, linewidths=0.3)
+    )
+    axes.autoscale_view()
+    axes.set_aspect("equal")
+    axes.axis("off")
+    return figure

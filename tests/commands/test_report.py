@@ -1,0 +1,284 @@
+"""The report: which runs stand together, what its tables and its page hold, what it leaves out."""
+
+from __future__ import annotations
+
+import base64
+import csv
+import json
+import re
+import shutil
+from dataclasses import replace
+from html.parser import HTMLParser
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+
+from meshspiral.commands.report import beside, file_name, main
+from meshspiral.experiment.runs import CONFIG, METRICS
+from meshspiral.reporting.groups import arrangements, collect, grouped, varied
+from meshspiral.reporting.tables import run_table
+from tests.commands.test_train import run
+from tests.conftest import toy_shapes
+from tests.data.test_remeshed import REMESH
+from tests.experiment.test_cli import QUICK, cli  # noqa: F401
+
+SWEEP = {
+    "fcs5": ["seq_len=5"],
+    "fcs5_again": ["seq_len=5", "seed=1"],
+    "fcs6": ["seq_len=6"],
+    "fcs5_metric": ["seq_len=5", "metric=true"],
+    "lstm5": ["model=lstm", "seq_len=5"],
+    "fcs6_metric": ["seq_len=6", "metric=true"],
+    "gcnn3": ["model=gcnn3", "model.patch.radius=0.2", "optim.lr=0.002"],
+}
+
+
+@pytest.fixture(scope="module")
+def sweep(tmp_path_factory, toy_overrides):
+    folder = tmp_path_factory.mktemp("sweep")
+    for name, overrides in SWEEP.items():
+        run(folder / name, [*toy_overrides, "optim.epochs=1", *overrides])
+    return folder
+
+
+class Page(HTMLParser):
+    """The texts of the tables' rows, all tags' attributes, and the data."""
+
+    def __init__(self, text):
+        super().__init__()
+        self.rows, self.attributes, self.data, self._in = [], [], "", None
+        self.feed(text)
+
+    def handle_starttag(self, tag, attributes):
+        self.attributes.append((tag, dict(attributes)))
+        if tag == "tr":
+            self.rows.append([])
+        if tag in ("td", "th"):
+            self.rows[-1].append("")
+        self._in = dict(attributes).get("id") if tag == "script" else tag
+
+    def handle_endtag(self, tag):
+        self._in = None
+
+    def handle_data(self, data):
+        if self._in in ("td", "th", "button"):
+            self.rows[-1][-1] += data.strip()
+        if self._in == "data":
+            self.data += data
+
+
+def test_runs_that_differ_in_the_seed_alone_are_one_group(sweep):
+    runs, broken = collect(str(sweep))
+    assert len(runs) == 7 and broken == []
+    groups = grouped(runs)
+    assert sorted(len(group.runs) for group in groups) == [1, 1, 1, 1, 1, 2]
+    [pair] = [group for group in groups if len(group.runs) == 2]
+    assert {r.folder.name for r in pair.runs} == {"fcs5", "fcs5_again"}
+    assert pair.curves.shape[0] == 2
+    assert varied(runs) == ["optim.lr"]
+
+
+def test_the_paper_s_arrangements_are_found(sweep):
+    groups = grouped(collect(str(sweep))[0])
+    found = {title: list(curves) for title, curves in arrangements(groups)}
+    networks = found["Networks at N = 5 without metric information, folder"]
+    assert sorted(networks) == ["FCS-NET, lr 0.004", "GCNN3, lr 0.002", "LSTM-NET, lr 0.004"]
+    lengths = [v for k, v in found.items() if k.startswith("Lengths of FCS-NET")]
+    assert lengths == 2 * [["N = 5", "N = 6"]]  # with and without metric information
+    [metric] = [v for k, v in found.items() if k.startswith("Metric information: FCS-NET, N = 5")]
+    assert sorted(metric) == ["with metric information", "without"]
+    assert not any("LSTM" in title for title in found)
+
+
+def test_the_report_is_one_page_with_tables_and_figures(cli, sweep, tmp_path):  # noqa: F811
+    code, out, err = cli(f"runs={sweep}", "output=report", "shapes=2", program=main)
+    assert code == 0, err
+    assert "7 runs, 0 left out" in out
+    folder = tmp_path / "report"
+    text = (folder / "index.html").read_text()
+    page = Page(text)
+    addresses = [v for _, a in page.attributes for k, v in a.items() if k in ("src", "href")]
+    assert [a for a in addresses if not a.startswith(("data:", "#"))] == []  # needs no network
+    columns, _ = run_table(grouped(collect(str(sweep))[0]))
+    assert page.rows[0] == columns and len(page.rows) == 1 + 7 + 1 + 1  # one group has two seeds
+    assert "±" in " ".join(page.rows[-1])
+    with open(folder / "table.csv") as file:
+        table = list(csv.reader(file))
+    assert table[0] == columns and len(table) == 8
+    kept = {row[-1]: row for row in table[1:]}
+    for name in SWEEP:
+        metrics = json.loads((sweep / name / METRICS).read_text())
+        row = dict(zip(columns, kept[str(sweep / name)], strict=True))
+        assert float(row["exact match (%)"]) == pytest.approx(100 * metrics["test/exact_match"])
+        assert int(float(row["parameters"])) == metrics["parameters"]
+    assert len(list(folder.glob("*.pdf"))) == text.count("<figcaption>") == 9
+    assert len(list(folder.glob("*.png"))) == 9
+    tex = (folder / "table.tex").read_text()
+    body = [line for line in tex.splitlines() if line.endswith(r"\\")]
+    assert len(body) == 7 and len({line.count("&") for line in body}) == 1
+    assert r"$\pm$" in tex and "_" not in tex.replace(r"\_", "")
+    marked = (folder / "table.md").read_text().splitlines()
+    assert len(marked) == 2 + 6 and len({line.count("|") for line in marked}) == 1
+    [pair] = [line for line in marked if "±" in line]
+    assert pair.startswith("| FCS-NET | 5 | no | folder | 2 | 0.004 |")
+
+
+def test_the_shapes_of_the_page_are_those_of_the_data_set(cli, sweep, tmp_path):  # noqa: F811
+    cli(f"runs={sweep}", "output=report", "shapes=2", program=main)
+    data = json.loads(Page((tmp_path / "report/index.html").read_text()).data)
+    scenes, surfaces = data["scenes"], data["surfaces"]
+    assert len(scenes) == 14 and len(surfaces) == 3  # the template and two shapes, once each
+    template = toy_shapes()["template.ply"]
+    scene = scenes[0]
+    points = (
+        np.frombuffer(base64.b64decode(surfaces[scene["template"]]["points"]), "<f4")
+        .reshape(3, -1)
+        .T
+    )
+    middle = (template.vertices.min(axis=0) + template.vertices.max(axis=0)) / 2
+    np.testing.assert_allclose(points, template.vertices - middle, atol=1e-5)
+    faces = (
+        np.frombuffer(base64.b64decode(surfaces[scene["shape"]]["faces"]), "<i4").reshape(3, -1).T
+    )
+    np.testing.assert_array_equal(faces, template.faces)
+    labels = np.frombuffer(base64.b64decode(scene["labels"]), "<i4")
+    assert labels.tolist() == list(range(162))
+
+
+def test_remeshed_shapes_are_surfaces_of_their_own(cli, toy_overrides, tmp_path):  # noqa: F811
+    run(tmp_path / "run", [*toy_overrides, *REMESH, "optim.epochs=1"])
+    code, out, err = cli("runs=run", "shapes=2", program=main)
+    assert code == 0 and "no view" not in out, err
+    [row] = csv.reader((tmp_path / "run/report/table.csv").read_text().splitlines()[1:])
+    assert row[0] == "FCS-NET" and row[3] == "folder mixed"
+    data = json.loads(Page((tmp_path / "run/report/index.html").read_text()).data)
+    sizes = {scene["name"]: len(base64.b64decode(scene["labels"])) // 4 for scene in data["scenes"]}
+    assert len(sizes) == 2 and 162 not in sizes.values()
+    for scene in data["scenes"]:
+        points = base64.b64decode(data["surfaces"][scene["shape"]]["points"])
+        assert len(points) == 3 * 4 * sizes[scene["name"]]
+
+
+def test_broken_runs_are_named_and_the_others_shown(cli, sweep, tmp_path):  # noqa: F811
+    copy = Path(shutil.copytree(sweep, tmp_path / "copy"))
+    (copy / "fcs6" / METRICS).write_text('{"test/exact_match": 0.')
+    (copy / "lstm5" / METRICS).unlink()
+    (copy / "gcnn3" / CONFIG).write_text("[not, a, config]")
+    (copy / "fcs5_metric" / CONFIG).write_text("of: another program")
+    code, out, err = cli("runs=copy", "shapes=0", program=main)
+    assert code == 0, err
+    assert "3 runs, 4 left out" in out
+    text = (copy / "report" / "index.html").read_text()
+    reasons = {
+        "fcs6": "metrics.json is damaged",
+        "lstm5": "not finished",
+        "gcnn3": "no config",
+        "fcs5_metric": "no config of a run",
+    }
+    for name, reason in reasons.items():
+        assert re.search(rf"copy/{name}\b.*{reason}", text)
+        assert re.search(rf"left out: copy/{name}\b.*{reason}", out)
+    code, out, _ = cli("runs=copy", "shapes=0", program=main)  # its own folder is no run
+    assert code == 0 and "3 runs, 4 left out" in out
+
+
+def test_without_the_data_set_all_but_the_shapes_is_there(cli, toy, toy_overrides, tmp_path):  # noqa: F811
+    here = Path(shutil.copytree(toy, tmp_path / "here"))
+    overrides = [o.replace(str(toy), str(here)) for o in toy_overrides]
+    run(tmp_path / "run", [*overrides, "optim.epochs=1"])
+    shutil.rmtree(here)
+    code, out, err = cli("runs=run", program=main)
+    assert code == 0, err
+    page = (tmp_path / "run/report/index.html").read_text()
+    assert "no view of its shapes" in out and "no view of its shapes" in page
+    assert json.loads(Page(page).data)["scenes"] == []
+
+
+def test_a_data_set_that_has_changed_is_not_drawn(cli, toy, toy_overrides, tmp_path):  # noqa: F811
+    here = Path(shutil.copytree(toy, tmp_path / "here"))
+    run(tmp_path / "run", [*(o.replace(str(toy), str(here)) for o in toy_overrides), *QUICK])
+    for path in here.rglob("*.ply"):
+        mesh = trimesh.load(path, process=False).subdivide()
+        mesh.export(path)
+    code, out, err = cli("runs=run", program=main)
+    assert code == 0, err
+    assert "has changed since" in out
+    page = (tmp_path / "run/report/index.html").read_text()
+    assert json.loads(Page(page).data)["scenes"] == []
+
+
+def test_only_seeds_are_pooled(sweep, tmp_path):
+    """Other test shapes, another precision: another group. A repeated seed is one."""
+    runs, _ = collect(str(sweep / "fcs5"))
+    [one] = runs
+    other = replace(one, outcome=replace(one.outcome, labels=one.outcome.labels[::-1]))
+    exact = replace(
+        one, config=one.config | {"trainer": one.config["trainer"] | {"precision": "64"}}
+    )
+    groups = grouped([one, other, exact, one])
+    assert sorted(len(group.runs) for group in groups) == [1, 1, 2]
+    assert all(group.seeds == {0} for group in groups)
+    assert {group.label() for group in groups} == {
+        "FCS-NET, N = 5, folder, precision 32",
+        "FCS-NET, N = 5, folder (2), precision 32",
+        "FCS-NET, N = 5, folder, precision 64",
+    }
+
+
+def test_seeds_that_shuffle_vertices_are_pooled(sweep):
+    [one] = collect(str(sweep / "fcs5"))[0]
+    shuffled = [
+        replace(
+            one,
+            config=one.config
+            | {"seed": seed, "data": one.config["data"] | {"shuffle_vertices": True}},
+            outcome=replace(one.outcome, labels=np.roll(one.outcome.labels, seed)),
+        )
+        for seed in (0, 1)
+    ]
+    [group] = grouped(shuffled)
+    assert group.seeds == {0, 1}
+
+
+def test_a_name_cannot_break_the_page(cli, sweep, tmp_path):  # noqa: F811
+    name = "<!--<script> [q] & it's 5 %"
+    shutil.copytree(sweep / "fcs5", tmp_path / "odd" / name)
+    shutil.copytree(sweep / "fcs6", tmp_path / "odd" / "b")
+    code, _, err = cli("runs=odd", program=main)
+    assert code == 0, err
+    text = (tmp_path / "odd/report/index.html").read_text()
+    script = text[text.index('id="data"') :]
+    assert "<" not in script[script.index(">") + 1 : script.index("</script>")]
+    page = Page(text)
+    assert name in {scene["run"] for scene in json.loads(page.data)["scenes"]}
+    assert f"odd/{name}" in {row[-1] for row in page.rows if row}
+    assert collect(str(tmp_path / "odd" / name))[0]  # it is no pattern
+
+
+def test_names_of_figures_are_short_and_their_own():
+    assert file_name("Lengths of FCS-NET++, a") != file_name("Lengths of FCS-NET, a")
+    long = "x" * 300
+    assert len(file_name(long)) < 120 and file_name(long) != file_name(long + "y")
+
+
+@pytest.mark.parametrize(
+    "arguments, message",
+    [
+        ([], "runs= is missing: a folder with runs, or a pattern"),
+        (["runs=nowhere"], "runs=nowhere: there is no such folder"),
+        (["runs=."], "runs=.: holds no finished run"),
+        (["runs=.", "shapes=-1"], "shapes must be at least 0; got -1"),
+    ],
+)
+def test_a_mistake_is_one_clear_line(cli, arguments, message):  # noqa: F811
+    code, out, err = cli(*arguments, program=main)
+    assert code == 1
+    assert message in (out + err).strip().splitlines()[-1]
+
+
+def test_a_report_lies_beside_its_runs():
+    assert beside("outputs/sweeps/a") == Path("outputs/sweeps/a")
+    assert beside("outputs/*/b") == Path("outputs")
+    assert beside("*") == Path()

@@ -1,0 +1,530 @@
+"""The main program: what a run leaves behind, and that it can be repeated and continued."""
+
+from __future__ import annotations
+
+import json
+import os
+import platform
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+from types import SimpleNamespace
+
+import lightning as L
+import numpy as np
+import pytest
+import torch
+from hydra import compose, initialize_config_dir
+from omegaconf import OmegaConf
+
+from meshspiral.commands import train as program
+from meshspiral.data.datamodule import rotate
+from meshspiral.data.sources import open_data
+from meshspiral.experiment.entry import CONF
+from meshspiral.experiment.runs import (
+    BEST,
+    CONFIG,
+    LAST,
+    METRICS,
+    RunError,
+    Stopped,
+    claim,
+    continued,
+)
+from meshspiral.experiment.schema import checked
+from meshspiral.training.callbacks import Checkpoint, Looks, Speed, WholeFiles
+from meshspiral.training.module import Correspondence
+from tests.conftest import STARTED
+
+ROOT = Path(CONF).parent
+
+FIGURES = {
+    "test/exact_match",
+    "test/geodesic_error",
+    "test/geodesic_error_diameter",
+    "test/within_0.01",
+    "test/within_0.05",
+    "test/within_0.10",
+    "parameters",
+    "seconds/preprocess",
+    "seconds/train",
+}
+
+
+def composed(overrides):
+    with initialize_config_dir(CONF, version_base="1.3"):
+        return checked(compose("train", overrides))
+
+
+def run(folder: Path, overrides: list[str]) -> dict[str, float]:
+    folder.mkdir(exist_ok=True)
+    config = composed(overrides)
+    if not (folder / CONFIG).exists():
+        claim(folder, config)
+    return program.train(config, folder)
+
+
+def weights(folder: Path, name: str = LAST) -> dict[str, torch.Tensor]:
+    return torch.load(folder / name, weights_only=True)["state_dict"]
+
+
+def same_weights(a: Path, b: Path) -> bool:
+    one, two = weights(a), weights(b)
+    assert one.keys() == two.keys()
+    return all(torch.equal(one[k], two[k]) for k in one)
+
+
+@pytest.fixture(scope="module")
+def whole_run(tmp_path_factory, toy_overrides):
+    """A run that nothing interrupts."""
+    folder = tmp_path_factory.mktemp("whole")
+    return folder, run(folder, toy_overrides)
+
+
+# -------------------------------------------------------------------------------- the run folder
+
+
+def test_a_run_folder_holds_what_is_promised(whole_run):
+    folder, metrics = whole_run
+    assert metrics.keys() >= FIGURES
+    assert json.loads((folder / METRICS).read_text()) == metrics
+    assert all(isinstance(value, int | float) for value in metrics.values())
+    for name in (CONFIG, BEST, LAST, "curve.png"):
+        assert (folder / name).is_file()
+    assert list(folder.glob("events.out.tfevents.*"))
+    assert metrics["parameters"] == sum(w.numel() for w in weights(folder).values())
+    assert not list(folder.rglob("*.tmp"))
+
+
+def test_metrics_hold_the_validation_of_the_best_checkpoint_and_the_time_of_all_training(whole_run):
+    folder, metrics = whole_run
+    saved = {name: torch.load(folder / name, weights_only=True) for name in (BEST, LAST)}
+    figures, curve = saved[BEST]["validation"]
+    assert figures.items() <= metrics.items()
+    assert curve[0] == pytest.approx(figures["val/exact_match"])
+    assert metrics["seconds/train"] > saved[LAST]["callbacks"]["Speed"]["seconds"]
+
+
+def test_what_is_logged_can_be_seen_in_tensorboard(whole_run):
+    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+    events = EventAccumulator(str(whole_run[0])).Reload()
+    scalars = set(events.Tags()["scalars"])
+    assert scalars >= {
+        "train/loss_step",
+        "train/loss_epoch",
+        "val/loss",
+        "val/exact_match",
+        "val/geodesic_error",
+        "val/geodesic_error_diameter",
+        "val/within_0.01",
+        "val/within_0.05",
+        "val/within_0.10",
+        "lr-Adam",
+        "train/steps_per_second",
+        "test/exact_match",
+    }
+    assert len(events.Scalars("val/loss")) == 4  # every epoch
+    assert events.Images("val/curve") and events.Images("val/shape") and events.Images("test/curve")
+
+
+def test_pictures_in_tensorboard_take_one_per_cent_of_the_time_at_most():
+    """But for the last: there are new ones only once those before have become cheap."""
+    looks, drawn = Looks(), []
+    looks._curve = lambda *arguments: (drawn.append(1), time.sleep(0.05))
+    trainer = SimpleNamespace(state=SimpleNamespace(fn="fit"), is_global_zero=False)
+    looks.on_train_start(trainer, None)
+    looks.on_validation_end(trainer, None)
+    looks.on_validation_end(trainer, None)
+    assert len(drawn) == 1
+    looks._began -= 80 * looks._spent  # as if so much time had gone by
+    looks.on_validation_end(trainer, None)
+    assert len(drawn) == 1
+    looks._began -= 30 * looks._spent
+    looks.on_validation_end(trainer, None)
+    assert len(drawn) == 2
+    trainer.state.fn = "validate"  # on its own
+    looks._began -= 600
+    looks.on_validation_end(trainer, None)
+    assert len(drawn) == 2
+
+
+def test_a_checkpoint_is_all_that_evaluation_needs(whole_run):
+    """The figures of metrics.json again, from best.ckpt alone and by other means."""
+    folder, metrics = whole_run
+    saved = torch.load(folder / BEST, weights_only=True)["hyper_parameters"]
+    config = saved["config"]
+    assert config == OmegaConf.to_container(OmegaConf.load(folder / CONFIG))
+    module = Correspondence.load_from_checkpoint(folder / BEST, weights_only=True).eval()
+    data = open_data(config)
+    data.prepare(["test"])
+    right, losses = [], []
+    for item in data.datasets["test"]:
+        spirals = rotate(item, config["seed"], "spirals", "evaluation")["spirals"]
+        with torch.no_grad():
+            scores = module.net(item["features"], spirals)
+        right.append(scores.argmax(1) == item["labels"])
+        losses.append(torch.nn.functional.cross_entropy(scores, item["labels"]))
+    exact = torch.cat(right).double().mean().item()
+    assert exact == pytest.approx(metrics["test/exact_match"], abs=1e-6)
+    assert torch.stack(losses).mean().item() == pytest.approx(metrics["test/loss"], rel=1e-4)
+
+
+def test_geodesic_errors_over_area_and_over_diameter_have_one_ratio(whole_run):
+    folder, metrics = whole_run
+    config = OmegaConf.to_container(OmegaConf.load(folder / CONFIG))
+    data = open_data(config)
+    ratio = metrics["test/geodesic_error"] / metrics["test/geodesic_error_diameter"]
+    assert ratio == pytest.approx(data.reference.diameter, rel=1e-5)
+
+
+def test_validation_figures_are_of_one_epoch_and_all_its_meshes(whole_run):
+    """Those that last.ckpt brings, from its weights by a fresh module."""
+    folder, _ = whole_run
+    config = OmegaConf.to_container(OmegaConf.load(folder / CONFIG))
+    data = open_data(config)
+    data.prepare(["val"])
+    module = Correspondence(config, data.in_features, data.num_classes)
+    trainer = L.Trainer(accelerator="cpu", logger=False, enable_progress_bar=False)
+    checkpoint = torch.load(folder / LAST, weights_only=True)
+    module.load_state_dict(checkpoint["state_dict"])
+    trainer.validate(module, datamodule=data)
+    saved, _ = checkpoint["validation"]
+    assert module.figures["val"] == pytest.approx(saved)
+
+
+def test_the_learning_rate_warms_up_and_follows_half_a_cosine(whole_run, toy_overrides):
+    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+    config = OmegaConf.to_container(composed(toy_overrides))
+    module = Correspondence(config, 160, 162)
+    module._trainer = SimpleNamespace(estimated_stepping_batches=24)
+    [factor] = module.configure_optimizers()["lr_scheduler"]["scheduler"].lr_lambdas
+    warmup = 4  # 0.15 of 24, rounded
+    expected = [(step + 1) / warmup for step in range(warmup)]
+    expected += [
+        0.5 * (1 + np.cos(np.pi * (s - warmup) / (24 - warmup))) for s in range(warmup, 24)
+    ]
+    np.testing.assert_allclose([factor(step) for step in range(24)], expected)
+    events = EventAccumulator(str(whole_run[0])).Reload().Scalars("lr-Adam")
+    assert len(events) >= 2
+    for event in events:
+        rate = config["optim"]["lr"] * expected[event.step]
+        assert event.value == pytest.approx(rate, rel=1e-5)
+
+
+def test_dropout_differs_between_meshes_and_epochs_and_not_between_runs(toy_overrides):
+    config = OmegaConf.to_container(composed(toy_overrides))
+    module = Correspondence(config, 160, 162)
+
+    def draw(mesh):
+        module.on_train_batch_start({"index": mesh}, 0)
+        return torch.rand(1).item()
+
+    assert len({draw(mesh) for mesh in range(5)}) == 5
+    assert draw(2) == draw(2)
+    before = draw(2)
+    module._trainer = SimpleNamespace(current_epoch=1)
+    assert draw(2) != before
+
+
+# ---------------------------------------------------------------------------------- repeatability
+
+
+def test_two_runs_with_one_seed_agree_to_the_bit_and_another_seed_differs(
+    whole_run, toy_overrides, tmp_path
+):
+    folder, metrics = whole_run
+    again = run(tmp_path / "again", toy_overrides)
+    assert same_weights(folder, tmp_path / "again")
+    assert {k: v for k, v in again.items() if "seconds" not in k} == {
+        k: v for k, v in metrics.items() if "seconds" not in k
+    }
+    run(tmp_path / "other", [*toy_overrides, "seed=1"])
+    assert not same_weights(folder, tmp_path / "other")
+
+
+@pytest.mark.parametrize("model", ["fcs", "lstm", "gcnn3"])
+def test_so_do_runs_of_all_networks_on_two_threads(model, toy_overrides, tmp_path):
+    threads = torch.get_num_threads()
+    several = ["trainer.threads=2", "model.channels=[100,150,200]", "optim.epochs=2"]
+    for name in "ab":
+        run(tmp_path / name, [*toy_overrides, f"model={model}", *several])
+        assert torch.get_num_threads() == 2
+    torch.set_num_threads(threads)
+    assert same_weights(tmp_path / "a", tmp_path / "b")
+
+
+STEPS = 6  # an epoch of the toy data set has as many
+
+
+@pytest.mark.parametrize(
+    "signum, step",
+    [(signal.SIGINT, step) for step in (1, 2, STEPS - 1, STEPS, STEPS + 3, 4 * STEPS)]
+    + [(signal.SIGTERM, 2), (signal.SIGTERM, STEPS)],
+)
+def test_a_stopped_run_goes_on_as_if_it_had_not_been(
+    whole_run, toy_overrides, tmp_path, monkeypatch, signum, step
+):
+    """Ctrl-C after the first step, in the middle, at the end of an epoch, and after the last."""
+    end = Speed.on_train_batch_end
+
+    def stop(self, trainer, *args):
+        end(self, trainer, *args)
+        if trainer.global_step == step:
+            os.kill(os.getpid(), signum)
+
+    monkeypatch.setattr(Speed, "on_train_batch_end", stop)
+    with pytest.raises(Stopped) as stopped:
+        run(tmp_path, toy_overrides)
+    assert stopped.value.signum == signum
+    assert (tmp_path / LAST).is_file() and not (tmp_path / METRICS).exists()
+    saved = torch.load(tmp_path / LAST, weights_only=True)
+    assert saved["global_step"] == (6 if step == STEPS - 1 else step)  # see OrderlyStop
+    monkeypatch.setattr(Speed, "on_train_batch_end", end)
+    metrics = run(tmp_path, toy_overrides)
+    assert same_weights(whole_run[0], tmp_path)
+    for name in FIGURES - {"seconds/preprocess", "seconds/train"}:
+        assert metrics[name] == whole_run[1][name]
+    assert metrics["seconds/train"] >= saved["callbacks"]["Speed"]["seconds"]
+
+
+def program_process(overrides, folder) -> subprocess.Popen:
+    command = [sys.executable, "-m", "src.train", *overrides, f"hydra.run.dir={folder}"]
+    process = subprocess.Popen(
+        command,
+        cwd=ROOT,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+        start_new_session=True,
+    )
+    STARTED.append(process)
+    return process
+
+
+def wait_for(condition, process, seconds=120):
+    end = time.monotonic() + seconds
+    while not condition():
+        assert process.poll() is None, process.communicate()[0]
+        assert time.monotonic() < end, "nothing happened"
+        time.sleep(0.01)
+
+
+def test_a_killed_run_resumes_to_the_same_weights(toy_overrides, tmp_path):
+    """A real process, a real kill -9, and resume=<run folder> on the command line."""
+    overrides = [*toy_overrides, "optim.epochs=12"]
+    run(tmp_path / "whole", overrides)
+    folder = tmp_path / "killed"
+    process = program_process(overrides, folder)
+    seen = set()
+
+    def third_checkpoint():
+        if (folder / LAST).exists():
+            seen.add((folder / LAST).stat().st_mtime_ns)
+        return len(seen) >= 3
+
+    wait_for(third_checkpoint, process)
+    process.kill()
+    process.wait()
+    epoch = torch.load(folder / LAST, weights_only=True)["epoch"]
+    assert 1 <= epoch < 11 and not (folder / METRICS).exists()
+    resumed = subprocess.run(
+        [sys.executable, "-m", "src.train", f"resume={folder}"],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert resumed.returncode == 0, resumed.stderr
+    assert same_weights(tmp_path / "whole", folder)
+    assert f"Run folder:  {folder}" in resumed.stdout
+    assert json.loads((folder / METRICS).read_text()).keys() >= FIGURES
+
+
+@pytest.mark.parametrize("signum, code", [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_a_stopped_program_says_how_to_go_on(toy_overrides, tmp_path, signum, code):
+    folder = tmp_path / "run"
+    process = program_process([*toy_overrides, "optim.epochs=500"], folder)
+    wait_for((folder / LAST).exists, process)
+    process.send_signal(signum)
+    output, _ = process.communicate(timeout=60)
+    assert process.returncode == code
+    assert f"To go on: python -m src.train resume={folder}" in output
+    assert "Traceback" not in output
+    torch.load(folder / LAST, weights_only=True)
+
+
+def test_a_checkpoint_that_cannot_be_written_leaves_the_last_one(tmp_path, monkeypatch):
+    io = WholeFiles()
+    io.save_checkpoint({"a": torch.ones(3)}, tmp_path / "last.ckpt")
+
+    def full(descriptor):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(os, "fsync", full)
+    with pytest.raises(OSError, match=r"cannot write the checkpoint .*last\.ckpt \(No space left"):
+        io.save_checkpoint({"a": torch.zeros(3)}, tmp_path / "last.ckpt")
+    assert torch.load(tmp_path / "last.ckpt", weights_only=True)["a"].sum() == 3
+    assert [p.name for p in tmp_path.iterdir()] == ["last.ckpt"]
+
+
+def test_a_damaged_checkpoint_is_one_message(whole_run, toy_overrides, tmp_path):
+    folder, _ = whole_run
+    config = composed(toy_overrides)
+    for damage, message in [(lambda b: b[:-500], "is damaged"), (lambda b: b"no", "is damaged")]:
+        (tmp_path / "checkpoints").mkdir(exist_ok=True)
+        (tmp_path / LAST).write_bytes(damage((folder / LAST).read_bytes()))
+        with pytest.raises(RunError, match=message):
+            program.train(config, tmp_path)
+    (tmp_path / LAST).write_bytes((folder / LAST).read_bytes())
+    (tmp_path / BEST).write_bytes(b"no")
+    with pytest.raises(RunError, match=r"best\.ckpt is damaged .* without its checkpoints"):
+        program.train(config, tmp_path)
+    (tmp_path / BEST).unlink()
+    with pytest.raises(RunError, match="is of another run: its seq_len is 8"):
+        program.train(composed([*toy_overrides, "seq_len=9"]), tmp_path)
+
+
+def test_a_run_folder_that_was_moved_keeps_its_best_checkpoint(whole_run, tmp_path):
+    callbacks = torch.load(whole_run[0] / LAST, weights_only=True)["callbacks"]
+    [state] = [s for key, s in callbacks.items() if "val/geodesic_error" in key]
+    assert Path(state["best_model_path"]) == whole_run[0] / BEST
+    moved = Checkpoint(tmp_path / "checkpoints", "best", monitor="val/geodesic_error")
+    moved.load_state_dict(state)
+    assert moved.best_model_score == state["best_model_score"] < 1
+    here = str(tmp_path / BEST)
+    assert moved.best_model_path == moved.kth_best_model_path == here
+    assert moved.best_k_models == {here: state["best_model_score"]}
+
+
+def test_resume_takes_the_runs_config_and_only_harmless_changes(tmp_path, toy_overrides):
+    claim(tmp_path, composed(toy_overrides))
+    resume = [f"resume={tmp_path}"]
+    assert continued(composed(resume), resume).model.channels == [12, 14, 16]
+    same = [*toy_overrides, *resume]
+    assert continued(composed(same), same).seq_len == 8
+    faster = [*resume, "trainer.threads=2"]
+    assert continued(composed(faster), faster).trainer.threads == 2
+    group = ["data=folder", *resume]
+    named = [*(o for o in toy_overrides if o.startswith("data.")), "data.workers=3"]
+    assert continued(composed([*group, *named]), [*group, *named]).data.workers == 3
+    for other in ("seq_len=9", "model=lstm", "seed=4", "optim.lr=0.1", "+metric=true"):
+        overrides = [*resume, other]
+        with pytest.raises(RunError, match="contradicts the run in"):
+            continued(composed(overrides), overrides)
+
+
+def test_a_run_from_before_a_setting_was_added_goes_on(tmp_path, toy_overrides):
+    config = composed(toy_overrides)
+    claim(tmp_path, config)
+    before = OmegaConf.load(tmp_path / CONFIG)
+    del before.data.shuffle_vertices, before.model.metric_layers, before.picture
+    OmegaConf.save(before, tmp_path / CONFIG)
+    claim(tmp_path, config)
+    resume = [f"resume={tmp_path}"]
+    assert continued(composed(resume), resume).model.metric_layers == "all"
+
+
+def test_resume_of_what_is_no_run_is_one_message(tmp_path):
+    for path, message in [(tmp_path / "none", "is not a folder"), (tmp_path, "it is no run")]:
+        overrides = [f"resume={path}"]
+        with pytest.raises(RunError, match=message):
+            continued(composed(overrides), overrides)
+    (tmp_path / CONFIG).write_text("a: [1, ")
+    with pytest.raises(RunError, match="can't be read"):
+        continued(composed([f"resume={tmp_path}"]), [f"resume={tmp_path}"])
+
+
+# -------------------------------------------------------------------------------------- learning
+
+
+@pytest.mark.parametrize(
+    "overrides",
+    [
+        ["model=lstm"],
+        ["model=lstm", "metric=true"],
+        ["model=lstm", "model.rings=1", "+metric=true"],
+        ["model=gcnn3"],
+        [
+            "model=gcnn3",
+            "model.patch.weights=gaussian",
+            "model.patch.rings=3",
+            "model.patch.rays=8",
+        ],
+        ["model=gcnn3", "trainer.precision=bf16"],
+        ["model=gcnn3", "trainer.precision=64"],
+        ["metric=true"],
+        ["metric=true", "model.metric_layers=first"],
+        ["trainer.precision=bf16"],
+        ["trainer.precision=auto"],
+        ["trainer.precision=64"],
+        ["optim.schedule=constant"],
+        ["trainer.val_every=2", "optim.epochs=3"],
+    ],
+    ids=" ".join,
+)
+def test_every_variant_trains(toy_overrides, tmp_path, overrides):
+    metrics = run(tmp_path, [*toy_overrides, "optim.epochs=1", *overrides])
+    assert metrics.keys() >= FIGURES and all(np.isfinite(v) for v in metrics.values())
+
+
+LEARN = ["optim.epochs=60", "optim.lr=0.01", "model.dropout=0.1", "trainer.val_every=20"]
+
+
+def test_a_network_learns_and_the_numbering_does_not_help_it(toy_overrides, tmp_path):
+    """With every mesh renumbered at random the figures agree within noise."""
+    plain = run(tmp_path / "plain", [*toy_overrides, *LEARN])
+    shuffled = run(tmp_path / "shuffled", [*toy_overrides, *LEARN, "data.shuffle_vertices=true"])
+    assert plain["test/exact_match"] > 0.6  # chance: 0.006
+    assert shuffled["test/exact_match"] == pytest.approx(plain["test/exact_match"], abs=0.12)
+    assert shuffled["test/geodesic_error"] == pytest.approx(plain["test/geodesic_error"], abs=0.06)
+
+
+def test_gcnn3_learns(toy_overrides, tmp_path):
+    gcnn3 = ["model=gcnn3", "model.patch.radius=0.2", "optim.lr=0.004"]
+    metrics = run(tmp_path, [*toy_overrides, *LEARN, *gcnn3])
+    assert metrics["test/exact_match"] > 0.5  # chance: 0.006
+
+
+def test_the_picture_is_drawn_without_a_display(toy_overrides, tmp_path, monkeypatch):
+    monkeypatch.delenv("DISPLAY", raising=False)
+    run(tmp_path, [*toy_overrides, "optim.epochs=1", "picture=true"])
+    import matplotlib.image
+
+    for name in ("correspondence.png", "errors.png"):
+        picture = matplotlib.image.imread(tmp_path / name)[..., :3]
+        assert (picture < 0.95).any(axis=2).mean() > 0.05  # something stands on the white ground
+        assert picture.std(axis=(0, 1)).min() > 0.02
+
+
+def die(*arguments):
+    os._exit(139)  # as VTK does, with a segmentation fault
+
+
+def test_without_opengl_there_is_no_picture_and_one_line_says_so(
+    toy_overrides, tmp_path, monkeypatch, caplog
+):
+    monkeypatch.setattr("meshspiral.viz.render._render", die)
+    run(tmp_path, [*toy_overrides, "optim.epochs=1", "picture=true"])
+    assert (
+        "no pictures of the shapes: VTK could not draw; it needs an OpenGL library" in caplog.text
+    )
+    assert (tmp_path / METRICS).is_file()
+
+
+def test_freed_memory_stays_with_the_process():
+    """Where the C library is GNU's; elsewhere nothing is promised."""
+    if platform.libc_ver()[0] != "glibc":
+        pytest.skip("another C library")
+    script = (
+        "import resource, torch; from meshspiral.training.trainer import keep_freed_memory; keep_freed_memory()\n"
+        "for i in range(20):\n"
+        "    torch.ones(2**24)\n"
+        "    if i == 1: first = resource.getrusage(resource.RUSAGE_SELF).ru_minflt\n"
+        "print(resource.getrusage(resource.RUSAGE_SELF).ru_minflt - first)"
+    )
+    done = subprocess.run([sys.executable, "-c", script], cwd=ROOT, capture_output=True, text=True)
+    assert int(done.stdout) < 9 * 2**14  # one such tensor has 2**14 pages, and 18 were made

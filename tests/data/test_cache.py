@@ -1,0 +1,265 @@
+"""The cache: nothing that is not exactly the asked-for result ever comes out of it."""
+
+import logging
+import multiprocessing
+import os
+import time
+import zipfile
+
+import numpy as np
+import pytest
+
+from meshspiral.data.cache import Store, StoreError, code_version, digest
+from meshspiral.data.preprocessing import (
+    PatchRecipe,
+    Recipe,
+    Task,
+    descriptor_task,
+    patch_task,
+    run_tasks,
+)
+from tests.meshes import bumpy_sphere
+
+
+@pytest.fixture
+def store(tmp_path):
+    return Store(tmp_path / "cache")
+
+
+ARRAYS = {"a": np.arange(12.0).reshape(3, 4), "b": np.array(["x", "yz"])}
+
+
+def same(arrays):
+    return arrays.keys() == ARRAYS.keys() and all((arrays[k] == ARRAYS[k]).all() for k in ARRAYS)
+
+
+def test_what_is_saved_is_loaded_and_nothing_else_lies_about(store):
+    assert store.load("kind", "key") is None
+    store.save("kind", "key", ARRAYS)
+    assert same(store.load("kind", "key"))
+    assert [p.name for p in store.root.rglob("*") if p.is_file()] == ["key.npz"]
+    assert store.size() == store.path("kind", "key").stat().st_size
+
+
+@pytest.mark.skipif(os.name == "nt", reason="Windows has no such modes")
+def test_others_may_read_what_the_umask_lets_them(store):
+    store.save("shot", "a", {"x": np.zeros(2)})
+    umask = os.umask(0)
+    os.umask(umask)
+    assert store.path("shot", "a").stat().st_mode & 0o777 == 0o666 & ~umask
+
+
+def test_a_result_is_computed_once(store):
+    calls = []
+    for _ in range(3):
+        assert same(store.get("kind", "key", lambda: calls.append(1) or ARRAYS))
+    assert len(calls) == 1
+
+
+def damage_truncate(path):
+    path.write_bytes(path.read_bytes()[:-40])
+
+
+def damage_empty(path):
+    path.write_bytes(b"")
+
+
+def damage_text(path):
+    path.write_text("not an archive")
+
+
+def damage_bit(path):
+    data = bytearray(path.read_bytes())
+    at = data.index(ARRAYS["a"].tobytes()) + 17
+    data[at] ^= 4
+    path.write_bytes(data)
+
+
+def damage_foreign(path):
+    np.savez(path, key=np.array("another"), a=np.zeros(3))
+
+
+def damage_another_array(path):
+    np.savez(path, key=np.array(["key", "a", "b"]), a=np.zeros(3), c=np.zeros(3))
+
+
+def damage_encrypted(path):
+    data = bytearray(path.read_bytes())
+    data[data.index(b"PK\x01\x02") + 8] |= 1  # the flag of an encrypted member
+    path.write_bytes(data)
+
+
+def damage_keyless(path):
+    np.savez(path, a=np.zeros(3))
+
+
+def damage_npy(path):
+    with open(path, "wb") as file:
+        np.save(file, np.zeros(3))
+
+
+def damage_pickle(path):
+    np.savez(path, key=np.array("key"), a=np.array([{}], dtype=object))
+
+
+def damage_zip(path):
+    with zipfile.ZipFile(path, "w") as archive:
+        archive.writestr("readme.txt", "hello")
+
+
+@pytest.mark.parametrize(
+    "damage",
+    [
+        damage_truncate,
+        damage_empty,
+        damage_text,
+        damage_bit,
+        damage_foreign,
+        damage_keyless,
+        damage_another_array,
+        damage_encrypted,
+        damage_npy,
+        damage_pickle,
+        damage_zip,
+    ],
+)
+def test_a_damaged_or_foreign_file_is_computed_again_with_a_warning(store, damage, caplog):
+    store.save("kind", "key", ARRAYS)
+    damage(store.path("kind", "key"))
+    with caplog.at_level(logging.WARNING):
+        assert same(store.get("kind", "key", lambda: ARRAYS))
+    assert "computing it again" in caplog.text and "key.npz" in caplog.text
+    assert same(store.load("kind", "key"))
+
+
+def test_a_crash_while_writing_leaves_no_file(store, monkeypatch):
+    monkeypatch.setattr(np, "savez", lambda *a, **k: (_ for _ in ()).throw(KeyboardInterrupt))
+    with pytest.raises(KeyboardInterrupt):
+        store.save("kind", "key", ARRAYS)
+    assert not [p for p in store.root.rglob("*") if p.is_file()]
+
+
+def test_a_full_disk_is_one_message_and_loses_nothing(store, monkeypatch):
+    store.save("kind", "old", ARRAYS)
+
+    def full(file, **arrays):
+        file.write(b"half")
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(np, "savez", full)
+    with pytest.raises(StoreError, match=r"cannot write the cache .*No space left.*cache_dir="):
+        store.save("kind", "new", ARRAYS)
+    assert [p.name for p in store.root.rglob("*") if p.is_file()] == ["old.npz"]
+
+
+def test_an_unwritable_folder_is_one_message(tmp_path):
+    (tmp_path / "file").write_text("in the way")
+    with pytest.raises(StoreError, match="cannot write the cache"):
+        Store(tmp_path / "file").save("kind", "key", ARRAYS)
+
+
+def write_often(root, value):
+    store = Store(root)
+    for _ in range(40):
+        store.save("kind", "key", {"a": np.full(5000, value)})
+
+
+def test_two_processes_may_write_one_key(store, caplog):
+    context = multiprocessing.get_context("spawn")
+    writers = [context.Process(target=write_often, args=(store.root, v)) for v in (1, 2)]
+    for writer in writers:
+        writer.start()
+    seen = []
+    caplog.set_level(logging.WARNING)
+    while any(writer.is_alive() for writer in writers):
+        if (arrays := store.load("kind", "key")) is not None:
+            seen.append(set(arrays["a"].tolist()))
+    assert all(writer.exitcode == 0 for writer in writers)
+    assert store.load("kind", "key") is not None and all(len(values) == 1 for values in seen)
+    assert seen and "damaged" not in caplog.text
+    assert [p.name for p in store.root.rglob("*") if p.is_file()] == ["key.npz"]
+
+
+def tasks():
+    recipe = Recipe(0.3, 4, patch=PatchRecipe(0.1, 3, 8))
+    spheres = [bumpy_sphere(seed, subdivisions=3) for seed in range(4)]
+    return [
+        t for mesh in spheres for t in (descriptor_task(mesh, recipe), patch_task(mesh, recipe))
+    ]
+
+
+def prepare(root, started):
+    started.release()
+    run_tasks(tasks(), Store(root), 1, "Preparing")
+
+
+def test_eight_processes_share_a_cold_cache_and_one_is_killed(tmp_path, caplog):
+    context = multiprocessing.get_context("spawn")
+    started = context.Semaphore(0)
+    processes = [
+        context.Process(target=prepare, args=(tmp_path / "all", started)) for _ in range(8)
+    ]
+    for process in processes:
+        process.start()
+    assert started.acquire(timeout=60)
+    end = time.monotonic() + 60
+    while not any((tmp_path / "all").rglob("*.npz")):  # until they are at it
+        assert time.monotonic() < end
+    processes[0].kill()  # in the middle, wherever that is
+    for process in processes:
+        process.join(120)
+    assert [process.exitcode for process in processes] == [-9] + 7 * [0]
+    prepare(tmp_path / "one", context.Semaphore(0))
+    caplog.set_level(logging.WARNING)
+    for task in tasks():
+        shared, alone = (
+            Store(tmp_path / name).load(task.kind, task.key) for name in ("all", "one")
+        )
+        assert shared.keys() == alone.keys()
+        for name in shared:
+            np.testing.assert_array_equal(shared[name], alone[name])
+    assert "damaged" not in caplog.text
+
+
+def test_a_digest_depends_on_everything():
+    a = np.arange(6, dtype=np.int32)
+    digests = [
+        digest(a),
+        digest(a.astype(np.int64)),
+        digest(a.reshape(2, 3)),
+        digest(a[::-1]),
+        digest(a, 1),
+        digest(a, 2),
+        digest(a, 1.0),
+        digest(a, None),
+        digest(a, "1"),
+        digest(1, a),
+        digest("ab", "c"),
+        digest("a", "bc"),
+    ]
+    assert len(set(digests)) == len(digests)
+    assert digest(a.copy()) == digest(a)
+
+
+def test_the_code_version_depends_on_the_source(tmp_path, monkeypatch):
+    import importlib
+
+    monkeypatch.syspath_prepend(tmp_path)
+    versions = []
+    for i in range(2):
+        (tmp_path / f"module_{i}.py").write_text(f"x = {i}\n")
+        versions.append(code_version(importlib.import_module(f"module_{i}")))
+    assert versions[0] != versions[1]
+
+
+def test_what_another_process_has_done_meanwhile_is_not_done_again(tmp_path):
+    store, done = Store(tmp_path), []
+
+    def compute(key):
+        for each in "abc":  # the others do theirs, and all the rest
+            store.save("toys", each, {"x": np.zeros(1)})
+        done.append(key)
+        return {"x": np.zeros(1)}
+
+    run_tasks([Task("toys", key, compute, (key,)) for key in "abc"], store, 1, "Preparing")
+    assert len(done) == 1

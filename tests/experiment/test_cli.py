@@ -1,0 +1,259 @@
+"""The command line as a user types it: what works word for word, and one line for a mistake."""
+
+from __future__ import annotations
+
+import json
+import re
+import signal
+import sys
+
+import pytest
+import torch
+from hydra.core.global_hydra import GlobalHydra
+from omegaconf import OmegaConf
+
+from meshspiral.commands.train import main
+from meshspiral.experiment.runs import write_metrics
+from meshspiral.experiment.schema import ConfigError
+from meshspiral.experiment.sweeps import announce, job_folder
+from tests.commands.test_train import ROOT, composed
+
+
+@pytest.fixture
+def cli(monkeypatch, tmp_path, capfd):
+    """Run the program in this process; returns (exit code, stdout, stderr)."""
+    import logging
+
+    def call(*arguments: str, program=main):
+        GlobalHydra.instance().clear()
+        handlers = {s: signal.getsignal(s) for s in (signal.SIGINT, signal.SIGTERM)}
+        root = logging.getLogger()
+        before = root.handlers[:], root.level
+        monkeypatch.setattr(sys, "argv", ["src.train", *arguments])
+        code = 0
+        try:
+            program()
+        except SystemExit as stop:
+            code = stop.code or 0
+        finally:
+            for signum, handler in handlers.items():
+                signal.signal(signum, handler)
+            root.handlers, root.level = before
+            GlobalHydra.instance().clear()
+        return code, *capfd.readouterr()
+
+    monkeypatch.chdir(tmp_path)
+    return call
+
+
+QUICK = ["optim.epochs=1"]
+
+
+def test_the_documented_line_works_word_for_word(cli, toy_overrides, tmp_path):
+    toy = [o for o in toy_overrides if not o.startswith("seq_len")]
+    code, out, err = cli("model=fcs", "seq_len=20", "+metric=true", *toy, *QUICK)
+    assert code == 0, err
+    assert "spirals of 20 vertices with metric information" in out
+    for line in (
+        "exact match",
+        "within 0.05 sqrt(area)",
+        "mean geodesic error / sqrt(area)",
+        "mean geodesic error / diameter",
+        "Run folder:",
+        "tensorboard --logdir",
+    ):
+        assert line in out
+    [folder] = (tmp_path / "outputs").glob("*/*_fcs")
+    assert (folder / "metrics.json").is_file() and (folder / "train.log").is_file()
+    assert OmegaConf.load(folder / "config.yaml").model.metric is True
+    assert "Warning" not in err
+
+
+def test_the_documented_sweep_works(cli, toy_overrides, tmp_path, monkeypatch):
+    """Which runs it has; what a run does has tests of its own."""
+    figures = {"test/exact_match": 0.0, "test/geodesic_error": 0.0}
+    monkeypatch.setattr(
+        "meshspiral.commands.train.train", lambda config, folder: write_metrics(folder, figures)
+    )
+    toy = [o for o in toy_overrides if not o.startswith(("seq_len", "data.cache_dir"))]
+    sweep = ["-m", "model=lstm,fcs", "seq_len=5,6", "+metric=true,false"]
+    code, _, err = cli(*sweep, *toy, *QUICK, "hydra.sweep.dir=sweep")
+    assert code == 0, err
+    runs = [path.parent for path in (tmp_path / "sweep").glob("*/metrics.json")]
+    assert len(runs) == 8
+    kinds = set()
+    for folder in runs:
+        config = OmegaConf.load(folder / "config.yaml")
+        kinds.add((config.model.name, config.seq_len, config.model.metric))
+        differs = f"model-{config.model.name}_seq_len-{config.seq_len}_metric-"
+        assert folder.name == differs + str(config.model.metric).lower()
+    assert len(kinds) == 8
+
+
+def test_all_three_networks_in_one_sweep(cli, toy_overrides, tmp_path):
+    code, _, err = cli("-m", "model=lstm,fcs,gcnn3", *toy_overrides, *QUICK, "hydra.sweep.dir=s")
+    assert code == 0, err
+    kept = {
+        path.parent.name: json.loads(path.read_text())
+        for path in (tmp_path / "s").glob("*/metrics.json")
+    }
+    assert sorted(kept) == ["model-fcs", "model-gcnn3", "model-lstm"]
+    assert (
+        len({tuple(sorted(metrics)) for metrics in kept.values()}) == 1
+    )  # the same figures of all
+
+
+@pytest.mark.parametrize(
+    "override, expected",
+    [
+        ("+metric=true", True),
+        ("metric=true", True),
+        ("++metric=false", False),
+        ("metric=null", False),
+        ("model.metric=true", True),
+        (None, False),
+    ],
+)
+def test_every_way_of_giving_metric(override, expected):
+    assert composed([override] if override else []).model.metric is expected
+
+
+def test_the_root_metric_wins_over_what_an_experiment_sets_of_the_model():
+    assert composed(["model.metric=true", "+metric=false"]).model.metric is False
+    assert composed(["model.metric=false", "+metric=true"]).model.metric is True
+
+
+@pytest.mark.parametrize(
+    "arguments, message",
+    [
+        (["+metric=maybe"], "metric=maybe: Value 'maybe' is not a valid bool"),
+        (["seq_len=0"], "seq_len must be at least 1; got 0"),
+        (["seq_len=many"], "seq_len=many: Value 'many' of type 'str' could not be converted"),
+        (["model=foo"], "Could not find 'model/foo'; there are: fcs, gcnn3, lstm"),
+        (["data=foo"], "there are: bodies, bodies_6890, bodies_6890_remeshed, bodies_mixed,"),
+        (["+metrics=true"], "unknown key metrics; did you mean metric?"),
+        (["+rate=1"], "unknown key rate; known: seq_len"),
+        (["metrics=true"], "Could not override 'metrics'"),
+        (["model.dropout=1.5"], "model.dropout must be in 0..1"),
+        (["model.metric_layers=some"], "model.metric_layers must be one of all, first; got some"),
+        (["+model.depth=3"], "unknown key model.depth"),
+        (["optim.lr=-1"], "optim.lr must be above 0; got -1"),
+        (["model=gcnn3", "+metric=true"], "metric=true needs a model with spirals"),
+        (["model=gcnn3", "model.patch.rays=15"], "model.patch.rays must be even and at least 2"),
+        (["model=gcnn3", "model.patch.radius=0"], "model.patch.radius must be above 0; got 0"),
+        (["model=gcnn3", "model.patch.weights=flat"], "must be one of interpolation, gaussian"),
+        (["model=gcnn3", "model.patch=null"], "model.patch is a group of settings; got None"),
+        (["model=gcnn3", "+model.patch.sectors=8"], "unknown key model.patch.sectors"),
+        (["optim.betas=[2,3]"], "optim.betas must be two numbers in 0..1"),
+        (["optim.betas=[0.9]"], "optim.betas must be two numbers in 0..1"),
+        (["optim=5"], "optim is a group of settings; got 5"),
+        (["data.shot=5"], "data.shot is a group of settings; got 5"),
+        (["data=folder", "data.train=5"], "data.train must be file names or patterns; got 5"),
+        (["optim.epochs=1", "trainer.val_every=2"], "trainer.val_every must be at most"),
+        (["optim.epochs=0"], "optim.epochs must be at least 1; got 0"),
+        (["data.shot.radius=0"], "data.shot.radius must be above 0"),
+        (["data.shuffle_vertices=perhaps"], "data.shuffle_vertices=perhaps: Value 'perhaps'"),
+        (["trainer.precision=8"], "trainer.precision must be one of 32, 64, bf16, auto; got 8"),
+        (["model.channels=[1,2]"], "model.channels must hold three numbers of at least 1"),
+        (["data=faust"], "data.root"),
+        (["data=folder", "data.root=/none", "data.template=t.ply"], "/none is not a folder"),
+        (["data.vertices=12"], "1500"),
+        (["seed=99999999999"], "seed must be below 4294967296; got 99999999999"),
+        (["resume=nowhere"], "resume=nowhere: is not a folder"),
+        (["optim.lr=", "x y"], "x y"),
+        (["hydra.run.dir=/dev/null/run"], "/dev/null"),
+        (["data.cache_dir=/dev/null/cache"], "cannot write the cache /dev/null/cache"),
+    ],
+    ids=lambda value: " ".join(value) if isinstance(value, list) else "",
+)
+def test_a_mistake_is_one_clear_line(cli, arguments, message):
+    code, out, err = cli(*arguments)
+    assert code in (1, 2)
+    last = (out + err).strip().splitlines()[-1]
+    assert last.startswith("error: ") and message in last, out + err
+    assert (out + err).count("error: ") == 1 and "Traceback" not in out + err
+
+
+@pytest.mark.parametrize(
+    "override",
+    ["trainer.accelerator=abacus", "trainer.devices=none", "trainer.strategy=luck"]
+    + ["trainer=gpu"] * (not torch.cuda.is_available()),
+)
+def test_a_device_that_is_not_there_is_one_clear_line(cli, toy_overrides, override):
+    code, out, err = cli(*toy_overrides, override)
+    last = (out + err).strip().splitlines()[-1]
+    assert code == 1 and last.startswith("error: trainer: accelerator")
+    assert "Traceback" not in out + err
+
+
+def test_help_shows_groups_root_keys_and_three_commands(cli):
+    code, out, _ = cli("--help")
+    assert code == 0
+    for word in (
+        "model: fcs, gcnn3, lstm",
+        "data: bodies",
+        "trainer: cpu, ddp, gpu",
+        "seq_len",
+        "metric",
+        "seed",
+        "resume",
+        "experiment",
+    ):
+        assert word in out
+    commands = [line.strip() for line in out.splitlines() if line.strip().startswith("python -m")]
+    assert len(commands) >= 3
+
+
+def test_the_documented_commands_compose():
+    """Every example of --help, and every command in a comment of conf/."""
+    commands = []
+    for path in (ROOT / "conf").rglob("*.yaml"):
+        text = path.read_text().replace("\\\n#", "")
+        for line in text.splitlines():
+            if "python -m src.train" in line:
+                words = line.split("python -m src.train")[1].replace("'", "").split()
+                commands.append([w for w in words if "=" in w])
+    assert len(commands) > 8
+    for words in commands:
+        single = [w if w.startswith("data.") or "[" in w else w.split(",")[0] for w in words]
+        if not any(word.startswith("resume") for word in words):
+            composed(single)
+
+
+def test_a_failing_job_of_a_sweep_says_why_in_its_log_and_the_others_run(
+    cli, toy_overrides, tmp_path
+):
+    code, out, err = cli("-m", "optim.lr=0,0.01", *toy_overrides, *QUICK, "hydra.sweep.dir=sweep")
+    assert code == 1
+    failed, done = (tmp_path / "sweep" / f"optim.lr-{lr}" for lr in ("0", "0.01"))
+    assert "error: optim.lr must be above 0; got 0" in (failed / "train.log").read_text()
+    assert (done / "metrics.json").is_file() and not (failed / "metrics.json").exists()
+    assert "Traceback" not in out + err
+
+
+def test_jobs_never_share_a_folder(monkeypatch):
+    """Also where a name had to lose what tells two of them apart."""
+    values = ["[train/*.ply]", "[train/?.ply]", "/a/b", "a/b", "x" * 300, "x" * 301, "1", "2"]
+    monkeypatch.setattr(sys, "argv", ["src.train", "-m", "seq_len=8", "data.root=1,2"])
+    announce()
+    names = [job_folder(["seq_len=8", f"data.root={value}"], 0) for value in values]
+    assert len(set(names)) == len(values)
+    assert names[-2:] == ["data.root-1", "data.root-2"]
+    assert all(re.fullmatch(r"[\w.+-]{1,130}", name) for name in names)
+    assert job_folder(["seq_len=8"], 3) == "seq_len-8"  # a sweep of one
+    assert job_folder([], 3) == "3"
+
+
+def test_a_folder_with_another_run_is_left_alone(cli, toy_overrides, tmp_path):
+    folder = [*toy_overrides, "hydra.run.dir=run"]
+    assert cli(*folder, *QUICK)[0] == 0
+    before = (tmp_path / "run" / "config.yaml").read_text()
+    code, out, err = cli(*folder, *QUICK, "seed=7")
+    assert code == 1 and "run holds another run (seed differ)" in out + err
+    assert (tmp_path / "run" / "config.yaml").read_text() == before
+    assert cli(*folder, *QUICK)[0] == 0  # the same run again: nothing left to do
+
+
+def test_config_errors_name_the_key():
+    with pytest.raises(ConfigError, match=r"trainer\.threads must be at least 1; got 0"):
+        composed(["trainer.threads=0"])
