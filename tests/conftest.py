@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import contextlib
+import logging
 import os
 import signal
-import subprocess
+import sys
 from pathlib import Path
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")  # read by torch: tests run on all cores already
@@ -13,8 +14,11 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")  # read by torch: tests run on all
 import numpy as np
 import pytest
 import trimesh
+from hydra.core.global_hydra import GlobalHydra
 
+from meshspiral.commands.train import main
 from meshspiral.geometry.mesh import Mesh
+from tests.helpers import STARTED
 from tests.meshes import bumpy_sphere
 
 TOY_SPLIT = {"train": 6, "val": 3, "test": 3}
@@ -44,12 +48,35 @@ def toy(tmp_path_factory) -> Path:
     return root
 
 
-STARTED: list[subprocess.Popen] = []  # by tests, in sessions of their own
+@pytest.fixture
+def cli(monkeypatch, tmp_path, capfd):
+    """Call a command in this process, in tmp_path; returns (exit code, stdout, stderr)."""
+
+    def call(*arguments: str, program=main):
+        GlobalHydra.instance().clear()
+        handlers = {s: signal.getsignal(s) for s in (signal.SIGINT, signal.SIGTERM)}
+        root = logging.getLogger()
+        before = root.handlers[:], root.level
+        monkeypatch.setattr(sys, "argv", ["src.train", *arguments])
+        code = 0
+        try:
+            program()
+        except SystemExit as stop:
+            code = stop.code or 0
+        finally:
+            for signum, handler in handlers.items():
+                signal.signal(signum, handler)
+            root.handlers, root.level = before
+            GlobalHydra.instance().clear()
+        return code, *capfd.readouterr()
+
+    monkeypatch.chdir(tmp_path)
+    return call
 
 
 @pytest.fixture(autouse=True)
-def nothing_goes_on():
-    """Whatever became of a test, its processes end with it."""
+def no_process_survives():
+    """Kill the processes that a test started."""
     yield
     while STARTED:
         with contextlib.suppress(ProcessLookupError):

@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 import trimesh
 
-from meshspiral.geometry.mesh import SUFFIXES, Mesh
+from meshspiral.data.mesh_files import SUFFIXES
+from meshspiral.geometry.mesh import Mesh
 
 
 def _pick(rng, array):

@@ -9,7 +9,8 @@ from meshspiral.geometry.mesh import Mesh
 
 
 def lattice(rows: int, columns: int) -> Mesh:
-    """A regular triangular lattice in the plane, seen from +z; vertex (i, j) is i * columns + j."""
+    """A regular triangular lattice in the plane z = 0, facing +z; vertex (i, j) is
+    i * columns + j."""
     i, j = np.mgrid[:rows, :columns]
     x, y = j + 0.5 * i, i * np.sqrt(3) / 2
     vertices = np.stack([x.ravel(), y.ravel(), np.zeros(x.size)], axis=1)
@@ -21,7 +22,7 @@ def lattice(rows: int, columns: int) -> Mesh:
 
 
 def bumpy_sphere(seed: int = 0, subdivisions: int = 2, bump: float = 0.25) -> Mesh:
-    """A closed surface of genus 0 without symmetry."""
+    """A closed surface of genus 0 without symmetries."""
     rng = np.random.default_rng(seed)
     sphere = trimesh.creation.icosphere(subdivisions=subdivisions)
     x = np.asarray(sphere.vertices)
@@ -37,7 +38,7 @@ def bumpy_sphere(seed: int = 0, subdivisions: int = 2, bump: float = 0.25) -> Me
 
 
 def torus(rows: int = 9, columns: int = 13) -> Mesh:
-    """A closed surface with a handle, every vertex of valence 6."""
+    """A torus whose vertices all have valence 6."""
     i, j = np.meshgrid(np.arange(rows), np.arange(columns), indexing="ij")
     u, v = 2 * np.pi * i / rows, 2 * np.pi * j / columns
     r = 1 + 0.4 * np.cos(u)
@@ -53,13 +54,13 @@ def torus(rows: int = 9, columns: int = 13) -> Mesh:
 
 
 def punctured(mesh: Mesh, share: float, seed: int = 0) -> Mesh:
-    """The mesh without a share of its faces: holes, boundaries, bow ties, lone vertices."""
+    """The mesh without a random share of its faces, with holes, bow ties and isolated vertices."""
     keep = np.random.default_rng(seed).random(len(mesh.faces)) >= share
     return Mesh(mesh.vertices, mesh.faces[keep])
 
 
 def union(*meshes: Mesh) -> Mesh:
-    """The meshes side by side, as components of one."""
+    """The meshes side by side, as components of one mesh."""
     offsets = np.cumsum([0, *(len(m.vertices) for m in meshes)])
     return Mesh(
         np.concatenate([m.vertices + 5.0 * i for i, m in enumerate(meshes)]),
@@ -68,13 +69,13 @@ def union(*meshes: Mesh) -> Mesh:
 
 
 def bow_tie() -> Mesh:
-    """Two triangles that meet in vertex 0 alone."""
+    """Two triangles with vertex 0 as their only common vertex."""
     vertices = [[0, 0, 0], [1, 0.5, 0], [1, -0.5, 0], [-1.2, -0.5, 0], [-1.2, 0.5, 0.1]]
     return Mesh(vertices, [[0, 2, 1], [0, 4, 3]])
 
 
 def two_cones() -> Mesh:
-    """Two closed fans of triangles that meet in vertex 0 alone."""
+    """Two closed fans of triangles with vertex 0 as their only common vertex."""
     rng = np.random.default_rng(3)
     rings = []
     for side in (1, -1):
@@ -88,7 +89,7 @@ def two_cones() -> Mesh:
 
 
 def random_meshes() -> dict[str, Mesh]:
-    """Closed and open meshes, with handles, holes, small components, bow ties."""
+    """Closed and open meshes, with handles, holes, small components and bow ties."""
     sphere = bumpy_sphere(1)
     triangle = Mesh([[0, 0, 0], [1, 0, 0], [0, 1, 0]], [[0, 1, 2]])
     tetrahedron = Mesh(

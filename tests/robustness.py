@@ -16,7 +16,7 @@ import numpy as np
 import trimesh
 from tqdm import tqdm
 
-from meshspiral.data.cache import Store
+from meshspiral.data.cache import Cache
 from meshspiral.data.datasets.bodies import Bodies
 from meshspiral.data.reference import ReferenceDistances
 from meshspiral.data.remeshed import Remeshed
@@ -26,7 +26,7 @@ from meshspiral.evaluation.metrics import geodesic_errors, point_errors
 from meshspiral.evaluation.outcome import evenly
 from meshspiral.matching.matcher import Matcher
 
-STORE = Store("outputs/cache")
+STORE = Cache("outputs/cache")
 HOLES = "a tenth of the faces gone"
 
 

@@ -1,4 +1,4 @@
-"""Evaluation from a run folder alone: the same figures again, files, rotations, clear messages."""
+"""Evaluating a run folder: metrics, files, other data sets, rotations, plugins, messages."""
 
 from __future__ import annotations
 
@@ -10,32 +10,37 @@ import numpy as np
 import pytest
 import torch
 from matplotlib.backends.backend_agg import FigureCanvasAgg
-from omegaconf import OmegaConf
 
-from meshspiral.commands.evaluate import main, merged
-from meshspiral.data.cache import Store
+from meshspiral.commands.evaluate import main
+from meshspiral.data.cache import Cache
 from meshspiral.data.datamodule import CorrespondenceData
-from meshspiral.data.preprocessing import Recipe
+from meshspiral.data.settings import ShotSettings
 from meshspiral.data.shapes import DataError, Shape, ShapeSet, SurfacePoints
 from meshspiral.evaluation.metrics import THRESHOLDS, point_errors
-from meshspiral.evaluation.outcome import ERRORS, Outcome, Result, evenly, result_of, rotations
-from meshspiral.experiment.runs import BEST, METRICS, RunError
+from meshspiral.evaluation.outcome import Outcome, Result, evenly, result_of, rotations
+from meshspiral.evaluation.retest import config_on_data
+from meshspiral.evaluation.run_folder import BEST, CONFIG, ERRORS, METRICS, RunError
+from meshspiral.experiment.schema import ConfigError
 from meshspiral.geometry.mesh import Mesh
-from meshspiral.training.predictor import template_of
-from meshspiral.viz.plots import (
-    all_curves_figure,
-    curve_figure,
-    encoded,
-    error_colors,
-    sketch_figure,
-)
+from meshspiral.neighbourhoods import Neighbourhood
+from meshspiral.training.checkpoints import template_of
+from meshspiral.viz.colors import error_colors
+from meshspiral.viz.plots import all_curves_figure, curve_figure, encoded, sketch_figure
 from meshspiral.viz.render import Row, render
-from tests.commands.test_train import composed, run
 from tests.conftest import toy_shapes
-from tests.experiment.test_cli import cli  # noqa: F401
+from tests.helpers import composed, run
 from tests.meshes import lattice
 
 SEED = 3
+REMESH = {"policy": "mixed", "vertices": 120, "copies": 1}
+FOLDER = {
+    "name": "folder",
+    "template": "template.ply",
+    "labels": "y",
+    "train": ["a"],
+    "val": ["b"],
+    "test": ["c"],
+}
 
 
 @pytest.fixture(scope="module")
@@ -51,7 +56,7 @@ def moved(trained, tmp_path):
     return Path(shutil.copytree(trained[0], tmp_path / "moved")), trained[1]
 
 
-def test_a_run_folder_gives_its_figures_again(cli, moved):  # noqa: F811
+def test_evaluating_a_run_folder_gives_its_metrics_again(cli, moved):
     folder, metrics = moved
     code, out, err = cli(f"run={folder}", "shapes=0", program=main)
     assert code == 0, err
@@ -60,8 +65,8 @@ def test_a_run_folder_gives_its_figures_again(cli, moved):  # noqa: F811
     assert len(again) == 6
     assert again == pytest.approx({key: metrics[key] for key in again}, rel=1e-6)
     assert json.loads((folder / METRICS).read_text()) == metrics  # the run's own file stays
-    kept, new = Outcome.load(folder / ERRORS), Outcome.load(written / ERRORS)
-    np.testing.assert_array_equal(kept.predicted, new.predicted)
+    old, new = Outcome.load(folder / ERRORS), Outcome.load(written / ERRORS)
+    np.testing.assert_array_equal(old.predicted, new.predicted)
     assert f"{100 * metrics['test/exact_match']:.2f} %" in out
     for kind, begin in {"png": b"\x89PNG", "pdf": b"%PDF", "svg": b"<?xml"}.items():
         assert (written / f"curve.{kind}").read_bytes().startswith(begin)
@@ -70,10 +75,10 @@ def test_a_run_folder_gives_its_figures_again(cli, moved):  # noqa: F811
 
 @pytest.mark.parametrize(
     "overrides",
-    [["trainer.precision=64"], ["model=lstm"], ["model=gcnn3", "model.patch.radius=0.2"]],
+    [["trainer.precision=64"], ["model=lstm"], ["model=gcnn3", "neighbourhood.radius=0.2"]],
     ids=lambda overrides: overrides[0],
 )
-def test_every_network_gives_its_figures_again(cli, toy_overrides, tmp_path, overrides):  # noqa: F811
+def test_evaluating_any_network_gives_its_metrics_again(cli, toy_overrides, tmp_path, overrides):
     metrics = run(tmp_path / "run", [*toy_overrides, "optim.epochs=1", *overrides])
     code, _, err = cli(f"run={tmp_path / 'run'}", "shapes=0", program=main)
     assert code == 0, err
@@ -96,7 +101,7 @@ def test_errors_npz_holds_each_vertex(trained):
     )
 
 
-def test_another_data_set_with_the_same_template_can_be_tested(cli, moved, toy):  # noqa: F811
+def test_another_data_set_with_the_same_template_can_be_tested(cli, moved, toy):
     folder, metrics = moved
     other = [
         "data=folder",
@@ -117,20 +122,20 @@ def test_another_data_set_with_the_same_template_can_be_tested(cli, moved, toy):
     assert Outcome.load(written / ERRORS).names != Outcome.load(folder / ERRORS).names
 
 
-def test_rotations_draw_other_spirals_each_time(cli, moved):  # noqa: F811
+def test_rotations_draw_other_spirals_each_time(cli, moved):
     folder, metrics = moved
     code, out, err = cli(f"run={folder}", "rotations=4", "shapes=0", program=main)
     assert code == 0, err
     written = folder / "evaluation" / "folder"
-    figures = json.loads((written / METRICS).read_text())
-    assert figures["rotations/runs"] == 4
-    assert 0 < figures["rotations/unchanged"] < 1
-    assert figures["rotations/exact_match/spread"] > 0
-    assert figures["rotations/exact_match/mean"] == pytest.approx(
+    repeated = json.loads((written / METRICS).read_text())
+    assert repeated["rotations/runs"] == 4
+    assert 0 < repeated["rotations/unchanged"] < 1
+    assert repeated["rotations/exact_match/spread"] > 0
+    assert repeated["rotations/exact_match/mean"] == pytest.approx(
         metrics["test/exact_match"], abs=0.1
     )
     assert (written / "rotations.pdf").is_file()
-    assert f"{100 * figures['rotations/unchanged']:.2f} % of the vertices" in out
+    assert f"{100 * repeated['rotations/unchanged']:.2f} % of the vertices" in out
 
 
 def test_rotations_pool_meshes_and_compare_runs():
@@ -145,31 +150,37 @@ def test_rotations_pool_meshes_and_compare_runs():
     np.testing.assert_allclose(found.geodesic_error, [0.025, 0.05, 0.025])
     assert found.unchanged == 0.5  # the first vertex of the first mesh, the second of the second
     assert found.curves.shape == (3, len(THRESHOLDS)) and found.curves[0, 0] == 0.75
-    figures = found.figures()
-    assert figures["exact_match/least"] == 0.5 and figures["exact_match/most"] == 0.75
-    assert figures["exact_match/mean"] == pytest.approx(2 / 3)
+    metrics = found.metrics()
+    assert metrics["exact_match/least"] == 0.5 and metrics["exact_match/most"] == 0.75
+    assert metrics["exact_match/mean"] == pytest.approx(2 / 3)
 
 
 @pytest.mark.parametrize(
     "arguments, message",
     [
-        ([], "run= is missing: the folder of a run"),
-        (["run=nowhere"], "run=nowhere: is not a folder"),
-        (["run=empty"], "empty holds no checkpoints/best.ckpt: it is no run"),
-        (["run=begun"], "begun holds no checkpoints/best.ckpt: it is no finished epoch"),
+        ([], "run= is missing: folder of a run"),
+        (["run=nowhere"], "run=nowhere is not a folder"),
+        (["run=empty"], "empty has no checkpoints/best.ckpt: it is no run"),
+        (["run=begun"], "begun has no checkpoints/best.ckpt: no epoch has finished"),
         (["run=damaged"], "damaged/checkpoints/best.ckpt is damaged"),
-        (["run=moved", "rotations=1"], "rotations must be 0 or at least 2, to compare; got 1"),
-        (["run=moved", "shapes=[nobody]"], "shapes: nobody is no test shape; there are: "),
-        (["run=moved", "shapes=some"], "shapes must be a number of test shapes, or a list"),
-        (["run=moved", "data=bodies"], "the 1500 vertices of another template than the one of 162"),
+        (["run=moved", "rotations=1"], "rotations must be 0 or at least 2, got 1"),
+        (
+            ["run=moved", "shapes=[nobody]"],
+            "the test shapes (test_0, test_1, test_2), got nobody",
+        ),
+        (
+            ["run=moved", "shapes=some"],
+            "a number of test shapes, or a list of their names, got some",
+        ),
+        (["run=moved", "data=bodies"], "which has 162 vertices; got another template, of 1500"),
         (["run=moved", "+depth=1"], "unknown key depth"),
-        (["run=moved", "accelerator=abacus"], "accelerator must be one of cpu, gpu; got abacus"),
+        (["run=moved", "accelerator=abacus"], "accelerator must be one of cpu, gpu, got abacus"),
     ],
 )
-def test_a_mistake_is_one_clear_line(cli, moved, tmp_path, arguments, message):  # noqa: F811
+def test_a_mistake_is_one_clear_line(cli, moved, tmp_path, arguments, message):
     (tmp_path / "empty").mkdir()
     (tmp_path / "begun").mkdir()
-    shutil.copy(moved[0] / "config.yaml", tmp_path / "begun")
+    shutil.copy(moved[0] / CONFIG, tmp_path / "begun")
     shutil.copytree(moved[0], tmp_path / "damaged")
     whole = (moved[0] / BEST).read_bytes()
     (tmp_path / "damaged" / BEST).write_bytes(whole[: len(whole) // 2])
@@ -179,44 +190,45 @@ def test_a_mistake_is_one_clear_line(cli, moved, tmp_path, arguments, message): 
     assert "Traceback" not in out + err
 
 
-def test_a_data_set_that_moved_can_be_named(cli, toy, toy_overrides, tmp_path):  # noqa: F811
+def test_a_data_set_that_moved_can_be_named(cli, toy, toy_overrides, tmp_path):
     here = Path(shutil.copytree(toy, tmp_path / "here"))
     overrides = [o.replace(str(toy), str(here)) for o in toy_overrides]
     run(tmp_path / "run", [*overrides, "optim.epochs=1"])
     there = here.rename(tmp_path / "there")
     code, out, _ = cli("run=run", "shapes=0", program=main)
     last = out.strip().splitlines()[-1]
-    assert code == 1 and str(here) in last and last.endswith("has moved: data.root=")
+    assert code == 1 and str(here) in last and last.endswith("has moved, add data.root=")
     code, _, err = cli("run=run", "shapes=0", f"data.root={there}", program=main)
     assert code == 0, err
 
 
-def test_rotations_are_for_spirals(cli, toy_overrides, tmp_path):  # noqa: F811
+def test_rotations_need_random_neighbourhoods(cli, toy_overrides, tmp_path):
     run(
         tmp_path / "run",
-        [*toy_overrides, "optim.epochs=1", "model=gcnn3", "model.patch.radius=0.2"],
+        [*toy_overrides, "optim.epochs=1", "model=gcnn3", "neighbourhood.radius=0.2"],
     )
     code, out, err = cli("run=run", "rotations=2", program=main)
-    assert code == 1 and "rotations= is for networks on spirals; gcnn3 has none" in out + err
+    message = "rotations must be 0 for gcnn3, whose patches are not random, got 2"
+    assert code == 1 and message in out + err
 
 
 def test_a_damaged_errors_npz_is_one_clear_line(trained, tmp_path):
     whole = (trained[0] / ERRORS).read_bytes()
     damaged = {"half": whole[: len(whole) // 2], "text": b"no", "empty": b""}
     rng = np.random.default_rng(0)
-    for place in rng.integers(len(whole), size=60):
-        damaged[f"byte_{place}"] = whole[:place] + bytes([whole[place] ^ 255]) + whole[place + 1 :]
+    for i in rng.integers(len(whole), size=60):
+        damaged[f"byte_{i}"] = whole[:i] + bytes([whole[i] ^ 255]) + whole[i + 1 :]
     refused = 0
     for name, content in damaged.items():
         (tmp_path / name).write_bytes(content)
         try:
-            outcome = Outcome.load(tmp_path / name)  # a byte that nobody reads does no harm
+            outcome = Outcome.load(tmp_path / name)  # a byte that is never read does no harm
             assert len(outcome.predicted) == outcome.first[-1]
         except RunError as error:
             assert f"{name} is damaged" in str(error)
             refused += 1
     assert refused > 40
-    with pytest.raises(RunError, match="is not there"):
+    with pytest.raises(RunError, match="does not exist"):
         Outcome.load(tmp_path / "nowhere")
 
 
@@ -228,7 +240,7 @@ def test_arrays_of_different_lengths_are_no_outcome(trained, tmp_path):
         Outcome.load(tmp_path / "short.npz")
 
 
-def test_figures_of_another_evaluation_do_not_stay(cli, moved):  # noqa: F811
+def test_plots_of_an_earlier_evaluation_are_removed(cli, moved):
     folder, _ = moved
     assert cli(f"run={folder}", "rotations=2", "shapes=0", program=main)[0] == 0
     assert (folder / "evaluation/folder/rotations.png").is_file()
@@ -237,23 +249,50 @@ def test_figures_of_another_evaluation_do_not_stay(cli, moved):  # noqa: F811
 
 
 @pytest.mark.parametrize(
-    "asked, kept",
+    "requested, expected",
     [
         (
             {"shot": {"bins": 8}},
             {"root": "here", "labels": "x", "shot": {"radius": 0.3, "bins": 8}},
         ),
         ({"root": None, "workers": 2}, {"root": "here", "labels": "x", "workers": 2}),
-        ({"name": "folder", "root": "there", "labels": None}, {"root": "there", "labels": None}),
+        (
+            {**FOLDER, "root": "there"},
+            {"root": "there", "labels": "y", "remesh": None, "workers": 1},
+        ),
+        (
+            {**FOLDER, "root": "there", "remesh": REMESH, "shuffle_vertices": False},
+            {"root": "there", "labels": "y", "remesh": REMESH, "shuffle_vertices": False},
+        ),
     ],
 )
-def test_what_is_asked_of_the_data_wins_over_the_run(toy_overrides, asked, kept):
-    trained = OmegaConf.to_container(composed(toy_overrides))
-    trained["data"] |= {"root": "here", "labels": "x"}
-    data = OmegaConf.to_container(merged(trained, asked))["data"]
-    for key, value in kept.items():
+def test_requested_data_settings_replace_those_of_the_run(toy_overrides, requested, expected):
+    own = ["data.root=here", "data.labels=x", "data.shuffle_vertices=true"]
+    own += [f"+data.remesh.{key}={value}" for key, value in REMESH.items()]
+    trained = composed([*toy_overrides, *own])
+    config = config_on_data(trained, requested)
+    data = config.data.model_dump()
+    for key, value in expected.items():
         assert data[key] == value
     assert data["shot"]["radius"] == 0.3
+    assert data["shuffle_vertices"] == requested.get("shuffle_vertices", True)
+    assert data["remesh"] == (requested.get("remesh") if "name" in requested else REMESH)
+    for group in ("model", "neighbourhood", "optim", "trainer", "seed"):
+        assert getattr(config, group) == getattr(trained, group)
+
+
+@pytest.mark.parametrize(
+    "requested, message",
+    [
+        ({"name": "folder", "root": None}, "data.root= is missing"),
+        ({"name": "bodies", "vertices": 1500, "train": []}, "unknown key data.train"),
+        ({"name": "nobody"}, "data.name must be one of .*bodies.*, got nobody"),
+        ({"shot": {"bins": 0}}, "data.shot.bins must be at least 1, got 0"),
+    ],
+)
+def test_requested_data_settings_are_checked(toy_overrides, requested, message):
+    with pytest.raises(ConfigError, match=message):
+        config_on_data(composed(toy_overrides), requested)
 
 
 # ------------------------------------------------------------------- the truth within a face
@@ -277,7 +316,10 @@ class Blurred(ShapeSet):
 
 @pytest.fixture
 def blurred(tmp_path):
-    return CorrespondenceData(Blurred(), Recipe(0.3, 4, 8), Store(tmp_path), workers=1)
+    spirals = Neighbourhood.registered["spiral"]
+    neighbourhood = spirals(spirals.Settings(name="spiral", seq_len=8, rings=None))
+    shot = ShotSettings(radius=0.3, bins=4)
+    return CorrespondenceData(Blurred(), shot, neighbourhood, Cache(tmp_path), workers=1)
 
 
 @pytest.mark.parametrize("shuffled", [False, True])
@@ -285,15 +327,15 @@ def test_an_error_is_measured_to_the_point_and_to_the_label_beside_it(blurred, s
     blurred.shuffle_vertices = shuffled
     blurred.prepare(["test"])
     item = blurred.datasets["test"][0]
-    labels, place = item["labels"].numpy(), blurred.reference.place
+    labels, positions = item["labels"].numpy(), blurred.reference.place
     result = result_of(labels, item, blurred.reference)
     assert (result.label_errors == 0).all()
-    point = np.einsum("vk,vkx->vx", item["weights"], place[item["corners"]])
-    np.testing.assert_allclose(result.errors, np.linalg.norm(point - place[labels], axis=1))
+    point = np.einsum("vk,vkx->vx", item["weights"], positions[item["corners"]])
+    np.testing.assert_allclose(result.errors, np.linalg.norm(point - positions[labels], axis=1))
     outcome = Outcome.of(["c"], [item], {0: result}, blurred.reference.diameter)
-    figures, curve = outcome.figures()
-    assert figures["geodesic_error"] > 0 == figures["geodesic_error_to_label"]
-    assert figures["exact_match"] == 1 and curve[0] == 0
+    metrics, curve = outcome.metrics()
+    assert metrics["geodesic_error"] > 0 == metrics["geodesic_error_to_label"]
+    assert metrics["exact_match"] == 1 and curve[0] == 0
 
 
 def test_the_distance_to_a_point_lies_between_those_to_its_corners(blurred):

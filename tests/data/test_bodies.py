@@ -1,4 +1,4 @@
-"""The bodies that come with the repository: what is promised about them holds."""
+"""The bundled bodies have the documented properties."""
 
 from pathlib import Path
 
@@ -24,7 +24,7 @@ def all_names(bodies: Bodies) -> list[str]:
     return [name for split in ("train", "val", "test") for name in bodies.names[split]]
 
 
-def test_counts_are_those_of_the_template(bodies):
+def test_bodies_have_the_counts_and_faces_of_the_template(bodies):
     vertices = len(bodies.template.vertices)
     assert vertices in SIZES and len(bodies.template.faces) == SIZES[vertices]
     for name in all_names(bodies)[::23]:
@@ -44,11 +44,11 @@ def test_shape_i_shows_subject_i_div_10_in_pose_i_mod_10(bodies):
     assert list(poses) == list(poses[:10]) * 10 and len(set(poses)) == 10
 
 
-def test_split_is_70_10_20_and_no_subject_is_in_two(bodies):
+def test_split_is_70_10_20_and_no_subject_is_in_two_splits(bodies):
     assert [len(bodies.names[split]) for split in ("train", "val", "test")] == [70, 10, 20]
-    people = {split: {n.split("_")[0] for n in names} for split, names in bodies.names.items()}
-    assert people["train"] == {f"s{i}" for i in range(7)}
-    assert people["val"] == {"s7"} and people["test"] == {"s8", "s9"}
+    subjects = {split: {n.split("_")[0] for n in names} for split, names in bodies.names.items()}
+    assert subjects["train"] == {f"s{i}" for i in range(7)}
+    assert subjects["val"] == {"s7"} and subjects["test"] == {"s8", "s9"}
 
 
 def euler_characteristic(mesh: Mesh) -> int:
@@ -68,9 +68,9 @@ def components(mesh: Mesh) -> int:
 
 
 def test_bodies_are_closed_manifolds_of_genus_0(bodies):
-    """Mesh allows one or two faces an edge and checks the winding; 3 F = 2 E leaves two.
+    """`Mesh` checks the winding and that edges have one or two faces; 3 F = 2 E implies two.
 
-    All share one connectivity, so the template's topology is everybody's.
+    All bodies share one connectivity, so the topology of the template is that of all.
     """
     mesh = bodies.template
     edges = np.unique(np.sort(mesh.faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)), axis=0)
@@ -81,7 +81,7 @@ def test_bodies_are_closed_manifolds_of_genus_0(bodies):
 
 
 def test_rounding_left_no_degenerate_face_and_no_coincident_vertices(bodies):
-    """The smallest face before rounding has 1.31 mm^2, at 6890 vertices."""
+    """Before rounding, the smallest face at 6890 vertices has an area of 1.31 mm^2."""
     for name in all_names(bodies):
         mesh = bodies.load(name).mesh
         areas = np.linalg.norm(mesh.face_normals, axis=1) / 2
@@ -89,14 +89,14 @@ def test_rounding_left_no_degenerate_face_and_no_coincident_vertices(bodies):
         assert len(set(map(tuple, mesh.vertices))) == len(mesh.vertices)
 
 
-def test_faces_look_outwards_and_bodies_have_the_size_of_people(bodies):
+def test_faces_point_outwards_and_bodies_have_the_size_of_people(bodies):
     for name in ["template", *all_names(bodies)[::10]]:
         mesh = bodies.template if name == "template" else bodies.load(name).mesh
         centroid = mesh.vertices[mesh.faces].mean(1)
         litres = 1000 * (centroid * mesh.face_normals).sum() / 6
         assert 10 < litres < 150
         assert 0.8 < np.ptp(mesh.vertices[:, 2]) < 2.4
-        left, right = mesh.vertices[:, 0].min(), mesh.vertices[:, 0].max()  # an A-pose's hands
+        left, right = mesh.vertices[:, 0].min(), mesh.vertices[:, 0].max()  # the hands in A-pose
         assert abs(left + right) < 0.05 < 0.3 < right
 
 
@@ -116,11 +116,11 @@ def test_files_are_small_and_finely_rounded(vertices, limit):
     assert path.stat().st_size < limit
     with np.load(path, allow_pickle=False) as file:
         assert file["verts"].dtype == file["template"].dtype == file["faces"].dtype == np.uint16
-        half_diagonal = np.linalg.norm(file["scale"]) / 2  # metres; the rounding error's bound
+        half_diagonal = np.linalg.norm(file["scale"]) / 2  # bound on the rounding error, in metres
     assert half_diagonal < 0.03e-3
 
 
-def test_changing_a_loaded_body_leaves_the_set_as_it_is():
+def test_changing_a_loaded_body_does_not_change_the_data_set():
     bodies = Bodies()
     before = bodies.load("s0_squat").mesh.vertices.copy()
     bodies.load("s0_squat").mesh.vertices[:] = 0
@@ -128,12 +128,12 @@ def test_changing_a_loaded_body_leaves_the_set_as_it_is():
 
 
 @pytest.mark.parametrize("vertices", [0, 5000, "many"])
-def test_another_size_is_refused_with_both_sizes_named(vertices):
+def test_another_size_is_rejected_and_both_sizes_are_named(vertices):
     with pytest.raises(DataError, match=f"1500 or 6890, got {vertices!r}"):
         Bodies(vertices)
 
 
-def test_an_unknown_name_is_refused():
+def test_an_unknown_name_is_rejected():
     with pytest.raises(DataError, match="'s10_a_pose'"):
         Bodies().load("s10_a_pose")
 

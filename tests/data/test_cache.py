@@ -1,4 +1,4 @@
-"""The cache: nothing that is not exactly the asked-for result ever comes out of it."""
+"""The cache returns the requested result or computes it, never anything else."""
 
 import logging
 import multiprocessing
@@ -9,21 +9,16 @@ import zipfile
 import numpy as np
 import pytest
 
-from meshspiral.data.cache import Store, StoreError, code_version, digest
-from meshspiral.data.preprocessing import (
-    PatchRecipe,
-    Recipe,
-    Task,
-    descriptor_task,
-    patch_task,
-    run_tasks,
-)
+from meshspiral.data.cache import Cache, CacheError, code_version, digest
+from meshspiral.data.preprocessing import Task, descriptor_task, neighbourhood_task, run_tasks
+from meshspiral.data.settings import ShotSettings
 from tests.meshes import bumpy_sphere
+from tests.neighbourhoods.made import patch
 
 
 @pytest.fixture
-def store(tmp_path):
-    return Store(tmp_path / "cache")
+def cache(tmp_path):
+    return Cache(tmp_path / "cache")
 
 
 ARRAYS = {"a": np.arange(12.0).reshape(3, 4), "b": np.array(["x", "yz"])}
@@ -33,26 +28,26 @@ def same(arrays):
     return arrays.keys() == ARRAYS.keys() and all((arrays[k] == ARRAYS[k]).all() for k in ARRAYS)
 
 
-def test_what_is_saved_is_loaded_and_nothing_else_lies_about(store):
-    assert store.load("kind", "key") is None
-    store.save("kind", "key", ARRAYS)
-    assert same(store.load("kind", "key"))
-    assert [p.name for p in store.root.rglob("*") if p.is_file()] == ["key.npz"]
-    assert store.size() == store.path("kind", "key").stat().st_size
+def test_saved_arrays_are_loaded_and_no_other_file_is_left(cache):
+    assert cache.load("kind", "key") is None
+    cache.save("kind", "key", ARRAYS)
+    assert same(cache.load("kind", "key"))
+    assert [p.name for p in cache.root.rglob("*") if p.is_file()] == ["key.npz"]
+    assert cache.size() == cache.path("kind", "key").stat().st_size
 
 
-@pytest.mark.skipif(os.name == "nt", reason="Windows has no such modes")
-def test_others_may_read_what_the_umask_lets_them(store):
-    store.save("shot", "a", {"x": np.zeros(2)})
+@pytest.mark.skipif(os.name == "nt", reason="Windows has no file modes")
+def test_the_umask_decides_who_may_read_a_file(cache):
+    cache.save("shot", "a", {"x": np.zeros(2)})
     umask = os.umask(0)
     os.umask(umask)
-    assert store.path("shot", "a").stat().st_mode & 0o777 == 0o666 & ~umask
+    assert cache.path("shot", "a").stat().st_mode & 0o777 == 0o666 & ~umask
 
 
-def test_a_result_is_computed_once(store):
+def test_a_result_is_computed_once(cache):
     calls = []
     for _ in range(3):
-        assert same(store.get("kind", "key", lambda: calls.append(1) or ARRAYS))
+        assert same(cache.get("kind", "key", lambda: calls.append(1) or ARRAYS))
     assert len(calls) == 1
 
 
@@ -123,74 +118,76 @@ def damage_zip(path):
         damage_zip,
     ],
 )
-def test_a_damaged_or_foreign_file_is_computed_again_with_a_warning(store, damage, caplog):
-    store.save("kind", "key", ARRAYS)
-    damage(store.path("kind", "key"))
+def test_a_damaged_or_foreign_file_is_computed_again_with_a_warning(cache, damage, caplog):
+    cache.save("kind", "key", ARRAYS)
+    damage(cache.path("kind", "key"))
     with caplog.at_level(logging.WARNING):
-        assert same(store.get("kind", "key", lambda: ARRAYS))
+        assert same(cache.get("kind", "key", lambda: ARRAYS))
     assert "computing it again" in caplog.text and "key.npz" in caplog.text
-    assert same(store.load("kind", "key"))
+    assert same(cache.load("kind", "key"))
 
 
-def test_a_crash_while_writing_leaves_no_file(store, monkeypatch):
+def test_a_crash_while_writing_leaves_no_file(cache, monkeypatch):
     monkeypatch.setattr(np, "savez", lambda *a, **k: (_ for _ in ()).throw(KeyboardInterrupt))
     with pytest.raises(KeyboardInterrupt):
-        store.save("kind", "key", ARRAYS)
-    assert not [p for p in store.root.rglob("*") if p.is_file()]
+        cache.save("kind", "key", ARRAYS)
+    assert not [p for p in cache.root.rglob("*") if p.is_file()]
 
 
-def test_a_full_disk_is_one_message_and_loses_nothing(store, monkeypatch):
-    store.save("kind", "old", ARRAYS)
+def test_a_full_disk_gives_one_message_and_loses_no_result(cache, monkeypatch):
+    cache.save("kind", "old", ARRAYS)
 
     def full(file, **arrays):
         file.write(b"half")
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(np, "savez", full)
-    with pytest.raises(StoreError, match=r"cannot write the cache .*No space left.*cache_dir="):
-        store.save("kind", "new", ARRAYS)
-    assert [p.name for p in store.root.rglob("*") if p.is_file()] == ["old.npz"]
+    with pytest.raises(CacheError, match=r"cannot write the cache .*No space left.*cache_dir="):
+        cache.save("kind", "new", ARRAYS)
+    assert [p.name for p in cache.root.rglob("*") if p.is_file()] == ["old.npz"]
 
 
-def test_an_unwritable_folder_is_one_message(tmp_path):
+def test_an_unwritable_folder_gives_one_message(tmp_path):
     (tmp_path / "file").write_text("in the way")
-    with pytest.raises(StoreError, match="cannot write the cache"):
-        Store(tmp_path / "file").save("kind", "key", ARRAYS)
+    with pytest.raises(CacheError, match="cannot write the cache"):
+        Cache(tmp_path / "file").save("kind", "key", ARRAYS)
 
 
 def write_often(root, value):
-    store = Store(root)
+    cache = Cache(root)
     for _ in range(40):
-        store.save("kind", "key", {"a": np.full(5000, value)})
+        cache.save("kind", "key", {"a": np.full(5000, value)})
 
 
-def test_two_processes_may_write_one_key(store, caplog):
+def test_two_processes_can_write_the_same_key(cache, caplog):
     context = multiprocessing.get_context("spawn")
-    writers = [context.Process(target=write_often, args=(store.root, v)) for v in (1, 2)]
+    writers = [context.Process(target=write_often, args=(cache.root, v)) for v in (1, 2)]
     for writer in writers:
         writer.start()
     seen = []
     caplog.set_level(logging.WARNING)
     while any(writer.is_alive() for writer in writers):
-        if (arrays := store.load("kind", "key")) is not None:
+        if (arrays := cache.load("kind", "key")) is not None:
             seen.append(set(arrays["a"].tolist()))
     assert all(writer.exitcode == 0 for writer in writers)
-    assert store.load("kind", "key") is not None and all(len(values) == 1 for values in seen)
+    assert cache.load("kind", "key") is not None and all(len(values) == 1 for values in seen)
     assert seen and "damaged" not in caplog.text
-    assert [p.name for p in store.root.rglob("*") if p.is_file()] == ["key.npz"]
+    assert [p.name for p in cache.root.rglob("*") if p.is_file()] == ["key.npz"]
 
 
 def tasks():
-    recipe = Recipe(0.3, 4, patch=PatchRecipe(0.1, 3, 8))
+    shot = ShotSettings(radius=0.3, bins=4)
     spheres = [bumpy_sphere(seed, subdivisions=3) for seed in range(4)]
     return [
-        t for mesh in spheres for t in (descriptor_task(mesh, recipe), patch_task(mesh, recipe))
+        task
+        for mesh in spheres
+        for task in (descriptor_task(mesh, shot), neighbourhood_task(mesh, patch(0.1, 3, 8)))
     ]
 
 
 def prepare(root, started):
     started.release()
-    run_tasks(tasks(), Store(root), 1, "Preparing")
+    run_tasks(tasks(), Cache(root), 1, "Preparing")
 
 
 def test_eight_processes_share_a_cold_cache_and_one_is_killed(tmp_path, caplog):
@@ -203,9 +200,9 @@ def test_eight_processes_share_a_cold_cache_and_one_is_killed(tmp_path, caplog):
         process.start()
     assert started.acquire(timeout=60)
     end = time.monotonic() + 60
-    while not any((tmp_path / "all").rglob("*.npz")):  # until they are at it
+    while not any((tmp_path / "all").rglob("*.npz")):  # until the first result is written
         assert time.monotonic() < end
-    processes[0].kill()  # in the middle, wherever that is
+    processes[0].kill()  # at a random point of its work
     for process in processes:
         process.join(120)
     assert [process.exitcode for process in processes] == [-9] + 7 * [0]
@@ -213,7 +210,7 @@ def test_eight_processes_share_a_cold_cache_and_one_is_killed(tmp_path, caplog):
     caplog.set_level(logging.WARNING)
     for task in tasks():
         shared, alone = (
-            Store(tmp_path / name).load(task.kind, task.key) for name in ("all", "one")
+            Cache(tmp_path / name).load(task.kind, task.key) for name in ("all", "one")
         )
         assert shared.keys() == alone.keys()
         for name in shared:
@@ -221,7 +218,7 @@ def test_eight_processes_share_a_cold_cache_and_one_is_killed(tmp_path, caplog):
     assert "damaged" not in caplog.text
 
 
-def test_a_digest_depends_on_everything():
+def test_a_digest_depends_on_type_shape_value_and_order():
     a = np.arange(6, dtype=np.int32)
     digests = [
         digest(a),
@@ -252,14 +249,14 @@ def test_the_code_version_depends_on_the_source(tmp_path, monkeypatch):
     assert versions[0] != versions[1]
 
 
-def test_what_another_process_has_done_meanwhile_is_not_done_again(tmp_path):
-    store, done = Store(tmp_path), []
+def test_results_that_another_process_saved_meanwhile_are_not_computed_again(tmp_path):
+    cache, done = Cache(tmp_path), []
 
     def compute(key):
-        for each in "abc":  # the others do theirs, and all the rest
-            store.save("toys", each, {"x": np.zeros(1)})
+        for each in "abc":  # as if other processes had saved all results
+            cache.save("toys", each, {"x": np.zeros(1)})
         done.append(key)
         return {"x": np.zeros(1)}
 
-    run_tasks([Task("toys", key, compute, (key,)) for key in "abc"], store, 1, "Preparing")
+    run_tasks([Task("toys", key, compute, (key,)) for key in "abc"], cache, 1, "Preparing")
     assert len(done) == 1

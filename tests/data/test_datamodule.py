@@ -1,44 +1,34 @@
 """What a network is served: the right tensors, fresh spirals, and nothing of the numbering."""
 
+import importlib
 import logging
 import os
-from dataclasses import replace
-from itertools import pairwise
 
 import lightning as L
 import numpy as np
 import pytest
 import torch
-from tqdm import tqdm
 
 from meshspiral.data import preprocessing
-from meshspiral.data.cache import Store
-from meshspiral.data.datamodule import CorrespondenceData, EpochSampler, draw_spirals
+from meshspiral.data.cache import Cache
+from meshspiral.data.datamodule import CorrespondenceData, EpochSampler
+from meshspiral.data.pool import run_in_pool
 from meshspiral.data.preprocessing import (
-    PatchRecipe,
-    Recipe,
-    Task,
-    by_rows_and_columns,
     descriptor_task,
-    first_directions,
-    load_task,
-    patch_task,
-    spiral_task,
+    neighbourhood_task,
 )
+from meshspiral.data.settings import ShotSettings
 from meshspiral.data.shapes import DataError, Shape, ShapeSet
-from meshspiral.geometry.geodesics import diameter
 from meshspiral.geometry.mesh import Mesh, MeshError
-from meshspiral.geometry.patches import geodesic_patches
 from meshspiral.geometry.shot import shot_descriptors
 from meshspiral.geometry.spirals import spiral_table
-from meshspiral.geometry.windows import gaussian_windows
+from meshspiral.neighbourhoods.spiral import Spiral
 from meshspiral.nn.layers import metric_features
 from tests.conftest import TOY_SPLIT, toy_shapes
-from tests.meshes import bumpy_sphere, lattice, punctured, union
+from tests.meshes import bumpy_sphere, lattice
+from tests.neighbourhoods.made import patch, spiral
 
-RECIPE = Recipe(shot_radius=0.3, shot_bins=4, seq_len=8)
-PATCHES = Recipe(shot_radius=0.3, shot_bins=4, patch=PatchRecipe(0.1, rings=3, rays=8))
-GAUSSIAN = replace(PATCHES, patch=replace(PATCHES.patch, weights="gaussian"))
+SHOT = ShotSettings(radius=0.3, bins=4)
 
 
 class Toy(ShapeSet):
@@ -52,15 +42,16 @@ class Toy(ShapeSet):
         return Shape(Mesh(mesh.vertices, mesh.faces, name), np.arange(162), 162)
 
 
-def serve(store, recipe=RECIPE, seed=0, shapes=None, **options):
-    data = CorrespondenceData(Toy(shapes), recipe, store, seed, workers=1, **options)
+def serve(store, neighbourhood=None, seed=0, shapes=None, **options):
+    neighbourhood = neighbourhood or spiral(8)
+    data = CorrespondenceData(Toy(shapes), SHOT, neighbourhood, store, seed, workers=1, **options)
     data.prepare()
     return data
 
 
 @pytest.fixture
 def store(tmp_path):
-    return Store(tmp_path)
+    return Cache(tmp_path)
 
 
 class Recorder(L.LightningModule):
@@ -122,28 +113,7 @@ def test_items_hold_what_they_say(store):
 def test_meshes_of_one_connectivity_share_one_table(store):
     data = serve(store)
     tables = {item["sequences"].data_ptr() for d in data.datasets.values() for item in d.items}
-    assert len(tables) == 1 and len(list((store.root / "spirals").iterdir())) == 1
-
-
-def test_every_start_is_drawn_equally_often():
-    mesh = punctured(bumpy_sphere(), 0.2)
-    table = spiral_table(mesh, 4)
-    sequences, first = torch.from_numpy(table.sequences), torch.from_numpy(table.first)
-    generator = torch.Generator().manual_seed(0)
-    draws = torch.stack([draw_spirals(sequences, first, generator)[:, 1] for _ in range(600)])
-    assert draws.dtype == torch.int64
-    for v in range(len(mesh.vertices)):
-        starts = table.sequences[table.first[v] : table.first[v + 1], 1]
-        counts = np.array([(draws[:, v] == int(s)).sum() for s in starts])
-        assert counts.sum() == 600
-        assert np.abs(counts - 600 / len(starts)).max() < 6 * np.sqrt(600 / len(starts))
-
-
-def test_drawn_spirals_are_rows_of_their_vertex():
-    table = spiral_table(union(lattice(3, 3), Mesh([[0, 0, 0]], [])), 5)
-    drawn = draw_spirals(torch.from_numpy(table.sequences), torch.from_numpy(table.first))
-    for v, row in enumerate(drawn.tolist()):
-        assert row in table.sequences[table.first[v] : table.first[v + 1]].tolist()
+    assert len(tables) == 1 and len(list((store.root / "spiral").iterdir())) == 1
 
 
 def test_training_draws_anew_in_every_iteration_and_validation_never(store):
@@ -187,94 +157,6 @@ def test_processes_divide_an_epoch_among_them(size, world):
     assert set(served) == set(range(size)) and len(served) - size < world
 
 
-# -------------------------------------------------------------------------------------- patches
-
-
-def dense_samples(patches, rings, rays):
-    """[V, rays, rings, V] from rows, and from columns."""
-    patches = {name: np.asarray(array) for name, array in patches.items()}
-    vertices = len(patches["sample_first"]) - 1
-    out = np.zeros((2, len(patches["first"]) - 1, vertices))
-    for i, (indices, weights, first) in enumerate(
-        [("vertices", "weights", "first"), ("samples", "sample_weights", "sample_first")]
-    ):
-        matrix = out[i].T if i else out[i]
-        for row, (begin, end) in enumerate(pairwise(patches[first])):
-            np.add.at(matrix[row], patches[indices][begin:end], patches[weights][begin:end])
-    return out.reshape(2, vertices, rays, rings, vertices)
-
-
-def test_patches_are_served_by_rows_and_by_columns(store):
-    data = serve(store, PATCHES)
-    item = data.datasets["val"][1]
-    assert not item.keys() & {"sequences", "first"}
-    dtypes = {name: str(t.dtype).removeprefix("torch.") for name, t in item["patches"].items()}
-    assert dtypes == {
-        "vertices": "int32",
-        "weights": "float32",
-        "first": "int32",
-        "samples": "int32",
-        "sample_weights": "float32",
-        "sample_first": "int32",
-    }
-    mesh = data.shapes.load("val/1.ply").mesh
-    table = geodesic_patches(mesh, 0.1 * diameter(mesh), 3, 8, first_directions(mesh))
-    expected = np.zeros((162, 3, 8, 162))
-    for v, ring, ray, corner in np.ndindex(table.indices.shape):
-        at = table.indices[v, ring, ray, corner]
-        expected[v, ring, ray, at] += table.weights[v, ring, ray, corner]
-    by_rows, by_columns = dense_samples(item["patches"], 3, 8)
-    np.testing.assert_allclose(by_rows, expected.transpose(0, 2, 1, 3), atol=1e-6)
-    np.testing.assert_array_equal(by_columns, by_rows)
-
-
-def test_a_sample_that_left_the_surface_has_no_entries():
-    mesh = lattice(4, 5)
-    arrays = patch_task(mesh, PATCHES).compute(mesh, PATCHES.patch)
-    turn = first_directions(mesh)
-    whole = geodesic_patches(mesh, 0.1 * diameter(mesh), 3, 8, turn).whole.transpose(0, 2, 1)
-    assert 0 < whole.mean() < 1
-    np.testing.assert_array_equal(np.diff(arrays["first"]), 3 * whole.ravel())
-    patches = by_rows_and_columns(arrays, 20)
-    by_rows, by_columns = dense_samples(patches, 3, 8)
-    np.testing.assert_array_equal(by_columns, by_rows)
-    np.testing.assert_allclose(by_rows.sum(3), whole, atol=1e-6)
-
-
-def test_gaussian_windows_are_served_in_the_same_order(store):
-    data = serve(store, GAUSSIAN)
-    mesh = data.shapes.load("val/1.ply").mesh
-    table = gaussian_windows(mesh, 0.1 * diameter(mesh), 3, 8, first_directions(mesh))
-    expected = np.zeros((162, 3, 8, 162))
-    for row, (begin, end) in enumerate(pairwise(table.first)):
-        expected.reshape(-1, 162)[row, table.indices[begin:end]] = table.weights[begin:end]
-    by_rows, by_columns = dense_samples(data.datasets["val"][1]["patches"], 3, 8)
-    np.testing.assert_array_equal(by_rows, expected.transpose(0, 2, 1, 3))
-    np.testing.assert_array_equal(by_columns, by_rows)
-
-
-def test_patches_are_served_as_they_are_in_every_iteration(store):
-    data = serve(store, PATCHES)
-    item = data.datasets["train"][0]
-    assert data.on_after_batch_transfer(item, 0) is item
-
-
-def test_registered_meshes_have_grids_that_begin_in_directions_of_their_own():
-    """What is alike in all of them, such as the first edge of a vertex, would give it away."""
-    shapes = toy_shapes()
-    a, b, again = (first_directions(shapes[f"train/{i}.ply"]) for i in (0, 1, 0))
-    assert np.array_equal(a, again) and np.abs(a - b).min() > 0
-    assert np.histogram(np.concatenate([a, b]), 4, (0, 2 * np.pi))[0].min() > 50
-
-
-def test_patch_radii_follow_the_size_of_the_shape(monkeypatch):
-    monkeypatch.setattr(preprocessing, "first_directions", lambda mesh: np.zeros(162))
-    mesh = bumpy_sphere()
-    large = Mesh(1000 * mesh.vertices, mesh.faces)
-    small, large = (patch_task(m, PATCHES).compute(m, PATCHES.patch) for m in (mesh, large))
-    np.testing.assert_allclose(small["weights"], large["weights"], atol=1e-5)
-
-
 # -------------------------------------------------------------------------------- the numbering
 
 
@@ -307,53 +189,54 @@ def test_every_mesh_is_shuffled_in_its_own_way_and_the_same_way_again(store):
 def test_a_second_run_computes_nothing(store, monkeypatch):
     serve(store)
     monkeypatch.setattr(preprocessing, "_descriptors", None)
-    monkeypatch.setattr(preprocessing, "_spirals", None)
+    monkeypatch.setattr(Spiral, "compute", None)
     serve(store)
 
 
-@pytest.mark.parametrize(
-    "change",
-    [{"shot_radius": 0.31}, {"shot_bins": 5}, {"seq_len": 9}, {"seq_len": None, "rings": 1}],
-)
-def test_keys_depend_on_every_parameter(change):
+def test_keys_depend_on_every_parameter():
     mesh = bumpy_sphere()
-    other = Recipe(**{**RECIPE.__dict__, **change})
-    keys = [
-        task(mesh, RECIPE).key == task(mesh, other).key for task in (descriptor_task, spiral_task)
-    ]
-    assert sorted(keys) == [False, True]
-
-
-@pytest.mark.parametrize(
-    "change", [{"radius": 0.11}, {"rings": 4}, {"rays": 16}, {"weights": "gaussian"}]
-)
-def test_the_key_of_patches_depends_on_every_parameter(change):
-    mesh, other = bumpy_sphere(), replace(PATCHES, patch=replace(PATCHES.patch, **change))
-    assert patch_task(mesh, other).key != patch_task(mesh, PATCHES).key
-    moved = Mesh(mesh.vertices + 1e-9, mesh.faces)
-    assert patch_task(moved, PATCHES).key != patch_task(mesh, PATCHES).key
-
-
-def test_patches_come_back_from_the_cache_as_they_were(store):
-    task = patch_task(bumpy_sphere(), PATCHES)
-    once, again = load_task(task, store), load_task(task, store)
-    assert store.has("patches", task.key) and once.keys() == again.keys()
-    assert all(np.array_equal(once[k], again[k]) and once[k].dtype == again[k].dtype for k in once)
+    settings = [SHOT, ShotSettings(radius=0.31, bins=4), ShotSettings(radius=0.3, bins=5)]
+    assert len({descriptor_task(mesh, each).key for each in settings}) == 3
+    neighbourhoods = [spiral(8), spiral(9), spiral(8, rings=1), spiral(8, rings=2)]
+    neighbourhoods += [patch(), patch(radius=0.11), patch(rings=4), patch(rays=16)]
+    neighbourhoods += [patch(weights="gaussian")]
+    assert len({neighbourhood_task(mesh, each).key for each in neighbourhoods}) == 9
 
 
 def test_keys_depend_on_content_and_code_and_not_on_the_name(monkeypatch):
     mesh = bumpy_sphere()
     moved = Mesh(mesh.vertices + 1e-9, mesh.faces)
     named = Mesh(mesh.vertices, mesh.faces, "another")
-    assert descriptor_task(named, RECIPE).key == descriptor_task(mesh, RECIPE).key
-    assert descriptor_task(moved, RECIPE).key != descriptor_task(mesh, RECIPE).key
-    assert spiral_task(moved, RECIPE).key == spiral_task(mesh, RECIPE).key
-    fewer = Mesh(mesh.vertices, mesh.faces[1:])
-    assert descriptor_task(fewer, RECIPE).key != descriptor_task(mesh, RECIPE).key
-    before = [task(mesh, RECIPE).key for task in (descriptor_task, spiral_task)]
+
+    def keys(mesh):
+        tasks = [descriptor_task(mesh, SHOT)]
+        tasks += [neighbourhood_task(mesh, each) for each in (spiral(8), patch())]
+        return [task.key for task in tasks]
+
+    before = keys(mesh)
+    assert keys(named) == before
+    same = [a == b for a, b in zip(keys(moved), before, strict=True)]
+    assert same == [False, True, False]  # spirals depend on the connectivity alone
+    assert not set(keys(Mesh(mesh.vertices, mesh.faces[1:]))) & set(before)
     monkeypatch.setattr(preprocessing, "code_version", lambda *modules: "another")
-    after = [task(mesh, RECIPE).key for task in (descriptor_task, spiral_task)]
-    assert all(a != b for a, b in zip(before, after, strict=True))
+    assert not set(keys(mesh)) & set(before)
+
+
+def test_keys_depend_on_the_code_of_every_class_of_a_neighbourhood(tmp_path, monkeypatch):
+    """Also on that of a subclass in a module of the user's."""
+    source = """
+from meshspiral.neighbourhoods.spiral import Spiral
+
+class Backwards(Spiral):
+    pass  # {}
+"""
+    monkeypatch.syspath_prepend(tmp_path)
+    mesh, keys = bumpy_sphere(), []
+    for version in "ab":
+        (tmp_path / f"backwards_{version}.py").write_text(source.format(version))
+        module = importlib.import_module(f"backwards_{version}")
+        keys.append(neighbourhood_task(mesh, module.Backwards(spiral(8).settings)).key)
+    assert len({*keys, neighbourhood_task(mesh, spiral(8)).key}) == 3
 
 
 def test_a_damaged_result_is_computed_again(store, caplog):
@@ -366,15 +249,19 @@ def test_a_damaged_result_is_computed_again(store, caplog):
 
 
 def test_the_pool_computes_what_one_process_computes(tmp_path, monkeypatch):
-    alone = serve(Store(tmp_path / "alone"))
+    alone = serve(Cache(tmp_path / "alone"))
     clock = iter(range(0, 10**6, 100))
     monkeypatch.setattr(preprocessing.time, "perf_counter", lambda: next(clock))  # "this is slow"
-    data = CorrespondenceData(Toy(), RECIPE, Store(tmp_path / "pool"), workers=2)
+    data = CorrespondenceData(Toy(), SHOT, spiral(8), Cache(tmp_path / "pool"), workers=2)
     started = []
-    run_in_pool = preprocessing._run_in_pool
-    monkeypatch.setattr(
-        preprocessing, "_run_in_pool", lambda *a: started.append(len(a[0])) or run_in_pool(*a)
-    )
+    run_in_pool = preprocessing.run_in_pool
+
+    def pool(function, jobs, *rest):
+        jobs = list(jobs)
+        started.append(len(jobs))
+        return run_in_pool(function, jobs, *rest)
+
+    monkeypatch.setattr(preprocessing, "run_in_pool", pool)
     data.prepare()
     assert started == [11]  # twelve descriptors and one spiral table, less the first two
     for split in TOY_SPLIT:
@@ -396,7 +283,7 @@ def test_undefined_descriptors_become_zeros_and_are_counted_once(store, caplog):
         data = serve(store, shapes=shapes)
     features = data.datasets["train"].items[0]["features"]
     assert torch.isfinite(features).all() and (features[0] == 0).all()
-    assert caplog.text.count("no descriptor at 1 of 162 vertices") == 1
+    assert caplog.text.count("SHOT is undefined at 1 of 162 vertices; using zeros") == 1
     assert "train/0.ply" in caplog.text
 
 
@@ -404,13 +291,13 @@ def test_a_mesh_without_area_is_one_message(store):
     shapes = toy_shapes()
     mesh = shapes["val/0.ply"]
     shapes["val/0.ply"] = Mesh(np.zeros_like(mesh.vertices), mesh.faces)
-    with pytest.raises(MeshError, match=r"val/0\.ply: no surface area"):
+    with pytest.raises(MeshError, match=r"val/0\.ply: surface area must be above 0"):
         serve(store, shapes=shapes)
 
 
 def test_a_split_without_meshes_is_one_message(store):
     shapes = {name: mesh for name, mesh in toy_shapes().items() if not name.startswith("val")}
-    with pytest.raises(DataError, match="no mesh to val"):
+    with pytest.raises(DataError, match="the split val must have at least 1 mesh, got 0"):
         serve(store, shapes=shapes)
 
 
@@ -430,10 +317,9 @@ def test_a_mesh_far_from_the_origin_has_the_same_metric_information(store):
     torch.testing.assert_close(one, two, rtol=0, atol=1e-5)
 
 
-def test_a_killed_process_of_the_pool_is_one_message(store):
-    tasks = [Task("shot", str(i), os._exit, (1,)) for i in range(2)]
-    with pytest.raises(DataError, match=r"data\.workers=1 needs less"):
-        preprocessing._run_in_pool(tasks, store, 2, tqdm(disable=True))
+def test_a_killed_process_of_the_pool_is_one_message():
+    with pytest.raises(DataError, match=r"killed, .* data\.workers=1 needs less memory"):
+        list(run_in_pool(os._exit, [(1,), (1,)], 2, "data.workers=1"))
 
 
 def test_labels_outside_the_template_are_refused():

@@ -1,4 +1,4 @@
-"""FAUST and its remeshed benchmark, on files of their layout and size made from the bodies."""
+"""FAUST and its remeshed benchmark, on files with their layout and size made from the bodies."""
 
 import inspect
 import random
@@ -17,13 +17,14 @@ from meshspiral.data.datasets.faust_benchmark import FaustBenchmark
 from meshspiral.data.shapes import DataError
 from meshspiral.data.sources import open_shapes
 from meshspiral.geometry.mesh import Mesh
+from tests.helpers import composed
 
 SITES = ["https://faust-leaderboard.is.tuebingen.mpg.de", "http://faust.is.tue.mpg.de"]
 REGISTRATIONS = "training/registrations"
 
 
 def ply(mesh: Mesh) -> bytes:
-    """A binary PLY, as FAUST's are."""
+    """The content of a binary PLY file, the format of FAUST."""
     faces = np.empty(len(mesh.faces), dtype=[("count", "u1"), ("corners", "<i4", 3)])
     faces["count"], faces["corners"] = 3, mesh.faces
     header = (
@@ -44,7 +45,7 @@ def files() -> dict[str, bytes]:
 
 @pytest.fixture(scope="module")
 def extracted(files, tmp_path_factory) -> Path:
-    """The folder MPI-FAUST; beside the registrations the scans, which are not to be read."""
+    """The folder MPI-FAUST, with registrations and with scans, which must not be read."""
     root = tmp_path_factory.mktemp("extracted") / "MPI-FAUST"
     for folder in ["training/registrations", "training/scans", "test/scans"]:
         (root / folder).mkdir(parents=True)
@@ -55,7 +56,7 @@ def extracted(files, tmp_path_factory) -> Path:
 
 
 def archive(path: Path, files: dict[str, bytes], folder: str, seed: int = 0) -> Path:
-    """A zip in shuffled order, with what archives from a Mac bring along."""
+    """A zip archive in shuffled order, with the resource files that macOS adds."""
     members = [(f"{folder}{REGISTRATIONS}/{name}", data) for name, data in files.items()]
     members += [(f"{folder}training/scans/{n.replace('reg', 'scan')}", b"no mesh") for n in files]
     members += [(f"__MACOSX/{folder}{REGISTRATIONS}/._{name}", b"") for name in files]
@@ -80,7 +81,7 @@ def root(request, extracted, zips) -> Path:
     return {"folder": extracted, "parent": extracted.parent, **zips}[request.param]
 
 
-def test_all_ways_to_give_faust_give_the_same_shapes_in_its_order(root):
+def test_every_kind_of_root_gives_the_same_shapes_in_the_same_order(root):
     faust, bodies = Faust(root), Bodies(6890)
     assert faust.names["train"] == [f"tr_reg_{i:03d}" for i in range(70)]
     assert faust.names["val"] == [f"tr_reg_{i:03d}" for i in range(70, 80)]
@@ -95,22 +96,22 @@ def test_all_ways_to_give_faust_give_the_same_shapes_in_its_order(root):
 
 
 @pytest.mark.parametrize("member", ["../evil.ply", "/etc/passwd", "a/../../b", "..\\\\evil.ply"])
-def test_an_archive_that_leads_out_of_itself_is_refused(member, files, tmp_path):
+def test_an_archive_with_paths_outside_of_it_is_rejected(member, files, tmp_path):
     path = archive(tmp_path / "a.zip", files, "MPI-FAUST/", seed=1)
     with zipfile.ZipFile(path, "a") as out:
         out.writestr(member, b"")
-    with pytest.raises(DataError, match="which leads out of it"):
+    with pytest.raises(DataError, match="which points outside the archive"):
         Faust(path)
 
 
-def test_an_archive_is_read_in_place(zips):
+def test_an_archive_is_read_without_extracting_it(zips):
     before = sorted(zips["zip"].parent.iterdir())
     Faust(zips["zip"]).load("tr_reg_042")
     assert sorted(zips["zip"].parent.iterdir()) == before
 
 
 def test_of_two_copies_the_complete_one_is_read(extracted, tmp_path):
-    partial = tmp_path / "a copy that broke off" / REGISTRATIONS
+    partial = tmp_path / "an interrupted copy" / REGISTRATIONS
     partial.mkdir(parents=True)
     (partial / "tr_reg_001.ply").write_bytes(b"rubbish")
     (tmp_path / "MPI-FAUST").symlink_to(extracted)
@@ -130,7 +131,7 @@ def test_of_two_complete_copies_the_first_by_name_is_read_whatever_the_order(tmp
 
 
 def assert_helps(message: str) -> None:
-    """One paragraph: what it is, where it comes from, where to put it, what to use instead."""
+    """The message is one paragraph: what is missing, where to get it, and what to use instead."""
     assert "\n" not in message
     for part in ["FAUST (", *SITES, "data.root=/path/to/MPI-FAUST", ".zip", "data=bodies_6890"]:
         assert part in message
@@ -150,7 +151,7 @@ def test_a_missing_root_is_named(tmp_path):
 
 
 @pytest.mark.parametrize("kind", ["text", "cut short", "empty"])
-def test_a_file_that_is_no_intact_zip_is_refused(kind, zips, tmp_path):
+def test_a_file_that_is_not_an_intact_zip_is_rejected(kind, zips, tmp_path):
     path = tmp_path / "MPI-FAUST.zip"
     whole = zips["zip"].read_bytes()
     path.write_bytes({"text": b"a page", "cut short": whole[: len(whole) // 2], "empty": b""}[kind])
@@ -169,20 +170,20 @@ def test_a_damaged_member_is_named(zips, tmp_path):
     path.write_bytes(data)
     faust = Faust(path)
     assert len(faust.load("tr_reg_004").mesh.vertices) == 6890
-    with pytest.raises(DataError, match=f"{member} cannot be unpacked") as error:
+    with pytest.raises(DataError, match=f"cannot extract {member}") as error:
         faust.load("tr_reg_005")
     assert_helps(str(error.value))
 
 
 @pytest.mark.parametrize("kind", ["folder", "zip"])
 def test_an_incomplete_set_says_how_many_are_missing_and_the_first(kind, tmp_path):
-    kept = {f"tr_reg_{i:03d}.ply": b"" for i in range(100) if i not in (7, 31, 99)}
+    present = {f"tr_reg_{i:03d}.ply": b"" for i in range(100) if i not in (7, 31, 99)}
     path = tmp_path / "MPI-FAUST"
     if kind == "zip":
-        archive(path, kept, "MPI-FAUST/")
+        archive(path, present, "MPI-FAUST/")
     else:
         (path / REGISTRATIONS).mkdir(parents=True)
-        for name in kept:
+        for name in present:
             (path / REGISTRATIONS / name).touch()
     with pytest.raises(DataError, match=r"lacks 3 of the 100 .* first .*tr_reg_007\.ply") as error:
         Faust(path)
@@ -198,7 +199,7 @@ def test_a_folder_or_zip_of_something_else_lacks_all(tmp_path):
         Faust(tmp_path / "other.zip")
 
 
-def test_a_registration_with_other_vertices_is_refused(extracted, tmp_path):
+def test_a_registration_with_another_number_of_vertices_is_rejected(extracted, tmp_path):
     (tmp_path / REGISTRATIONS).mkdir(parents=True)
     for file in (extracted / REGISTRATIONS).iterdir():
         (tmp_path / REGISTRATIONS / file.name).symlink_to(file)
@@ -210,7 +211,7 @@ def test_a_registration_with_other_vertices_is_refused(extracted, tmp_path):
         faust.load("tr_reg_003")
 
 
-def test_an_unknown_registration_is_refused(extracted):
+def test_an_unknown_registration_is_rejected(extracted):
     with pytest.raises(DataError, match="'tr_reg_100'"):
         Faust(extracted).load("tr_reg_100")
 
@@ -220,7 +221,7 @@ def test_an_unknown_registration_is_refused(extracted):
 
 @cache
 def remeshed(number: int) -> tuple[Mesh, np.ndarray]:
-    """A stand-in for a remeshed shape: other counts than the template's, and labels that repeat."""
+    """A substitute for a remeshed shape: not the template's counts, and repeated labels."""
     mesh = Bodies(1500).template
     labels = np.random.default_rng(number).integers(0, 6890, 1500)
     return Mesh(mesh.vertices + number, mesh.faces), labels
@@ -244,7 +245,7 @@ def benchmark_files(tmp_path_factory) -> Path:
 
 @pytest.fixture
 def benchmark_root(benchmark_files, tmp_path) -> Path:
-    """The repository's layout, for one test to change."""
+    """A copy of the benchmark's repository that a test may change."""
     return shutil.copytree(benchmark_files, tmp_path / "repository")
 
 
@@ -276,22 +277,22 @@ def test_benchmark_can_train_on_its_own_meshes_of_training_subjects(extracted, b
     assert len(benchmark.names["test"]) == 20
 
 
-def test_a_subject_that_is_trained_on_is_not_tested_on(extracted, benchmark_root, caplog):
+def test_training_subjects_are_left_out_of_the_test(extracted, benchmark_root, caplog):
     write(benchmark_root / "data", "iso", [80, 85])
     train = ["iso/tr_reg_iso_08*.ply"]
     benchmark = FaustBenchmark(extracted, benchmark_root, policy="qes", train=train)
     assert benchmark.names["train"] == ["tr_reg_iso_080", "tr_reg_iso_085"]
     assert benchmark.names["test"] == [f"tr_reg_qes_{i:03d}" for i in range(90, 100)]
     assert len(benchmark.names["val"]) == 10
-    assert "10 of 20 shapes for test show a subject that is trained on" in caplog.text
+    assert "10 of 20 test shapes show a training subject and are left out" in caplog.text
 
 
-def test_benchmark_refuses_to_train_on_all_that_it_tests_on(extracted, benchmark_root):
-    with pytest.raises(DataError, match="all subjects there are for test"):
+def test_benchmark_rejects_training_on_all_test_subjects(extracted, benchmark_root):
+    with pytest.raises(DataError, match="train contains every subject of test"):
         FaustBenchmark(extracted, benchmark_root, policy="qes", train=["qes/*.ply"])
 
 
-def test_benchmark_refuses_training_meshes_of_one_name_or_unknown_number(extracted, benchmark_root):
+def test_benchmark_rejects_training_meshes_of_equal_or_invalid_names(extracted, benchmark_root):
     data = benchmark_root / "data"
     write(data, "iso", [1])
     (data / "copy").mkdir()
@@ -299,13 +300,13 @@ def test_benchmark_refuses_training_meshes_of_one_name_or_unknown_number(extract
     with pytest.raises(DataError, match="have the same name"):
         FaustBenchmark(extracted, data, policy="qes", train=["iso/*.ply", "copy/*.ply"])
     (data / "copy" / "mine.ply").touch()
-    with pytest.raises(DataError, match=r"mine\.ply is not called"):
+    with pytest.raises(DataError, match=r"name of .*mine\.ply must be tr_reg_<policy>_<number>"):
         FaustBenchmark(extracted, data, policy="qes", train=["copy/mine.ply"])
 
 
 @pytest.mark.parametrize("policy", ["cloud", None])
-def test_another_policy_is_refused_with_the_known_ones_named(extracted, benchmark_root, policy):
-    with pytest.raises(DataError, match=f"iso, qes, mc, dense; got {policy!r}"):
+def test_another_policy_is_rejected_and_the_known_ones_named(extracted, benchmark_root, policy):
+    with pytest.raises(DataError, match=f"iso, qes, mc, dense, got {policy!r}"):
         FaustBenchmark(extracted, benchmark_root, policy=policy)
 
 
@@ -313,7 +314,7 @@ def test_benchmark_says_where_it_comes_from_when_missing(extracted, benchmark_ro
     url = "github.com/nmwsharp/discretization-robust-correspondence-benchmark"
     with pytest.raises(DataError, match=f"benchmark_root is not set.*{url}"):
         FaustBenchmark(extracted, None)
-    with pytest.raises(DataError, match=f"{tmp_path}/no holds neither data/iso nor iso.*{url}"):
+    with pytest.raises(DataError, match=f"{tmp_path}/no contains neither data/iso nor iso.*{url}"):
         FaustBenchmark(extracted, tmp_path / "no")
     for i in (81, 90):
         (benchmark_root / f"data/qes/tr_reg_qes_{i:03d}.txt").unlink()
@@ -327,15 +328,15 @@ def test_benchmark_says_where_it_comes_from_when_missing(extracted, benchmark_ro
         (lambda lines: lines[:-1], "1499 labels for a mesh of 1500 vertices"),
         (lambda lines: [*lines, "0"], "1501 labels for a mesh of 1500 vertices"),
         (lambda lines: [], "0 labels for a mesh of 1500 vertices"),
-        (lambda lines: [*lines[:6], "nan", *lines[7:]], "line 7 is 'nan'"),
-        (lambda lines: [*lines[:6], "3.5", *lines[7:]], "line 7 is '3.5'"),
-        (lambda lines: [*lines[:6], "", *lines[7:]], "line 7 is ''"),
-        (lambda lines: [*lines[:6], "9" * 30, *lines[7:]], "line 7 is '999"),
+        (lambda lines: [*lines[:6], "nan", *lines[7:]], "line 7 must be .*, got 'nan'"),
+        (lambda lines: [*lines[:6], "3.5", *lines[7:]], "line 7 must be .*, got '3.5'"),
+        (lambda lines: [*lines[:6], "", *lines[7:]], "line 7 must be .*, got ''"),
+        (lambda lines: [*lines[:6], "9" * 30, *lines[7:]], "line 7 must be .*, got '999"),
         (lambda lines: ["6890", *lines[1:]], r"1 labels outside 0\.\.6889.*vertex 0 has 6890"),
         (lambda lines: ["-1", *lines[1:]], r"1 labels outside 0\.\.6889.*vertex 0 has -1"),
     ],
 )
-def test_a_wrong_label_file_is_refused_by_name(extracted, benchmark_root, change, message):
+def test_an_invalid_label_file_is_rejected_by_name(extracted, benchmark_root, change, message):
     path = benchmark_root / "data/qes/tr_reg_qes_080.txt"
     path.write_text("\n".join(change(path.read_text().splitlines())))
     benchmark = FaustBenchmark(extracted, benchmark_root, policy="qes")
@@ -354,14 +355,17 @@ def test_the_configuration_has_every_argument(data_set):
 
 
 @pytest.mark.parametrize("name", ["faust_remeshed", "bodies_6890_remeshed"])
-def test_each_shape_can_be_remeshed_on_its_own(name, extracted, tmp_path):
-    config = yaml.safe_load((Path(__file__).parents[2] / f"conf/data/{name}.yaml").read_text())
-    assert config["remesh"] == {"policy": "isotropic", "vertices": 5000, "copies": 1}
-    config["remesh"]["vertices"] = 300
-    root = {"root": str(extracted)} if "root" in config else {}
-    shapes = open_shapes({**config, **root, "cache_dir": str(tmp_path), "workers": 1})
+def test_each_shape_can_be_remeshed_separately(name, extracted, tmp_path):
+    root = [f"data.root={extracted}"] if name.startswith("faust") else []
+    assert composed([f"data={name}", *root]).data.remesh.model_dump() == {
+        "policy": "isotropic",
+        "vertices": None,
+        "copies": 1,
+    }
+    words = [f"data={name}", *root, "data.remesh.vertices=300", f"data.cache_dir={tmp_path}"]
+    shapes = open_shapes(composed([*words, "data.workers=1"]).data)
     name = shapes.names["test"][0]
     shape, source = shapes.load(name), shapes.source(name)
     assert len(shape.mesh.vertices) == 300 and shape.template_size == 6890
-    there = source.mesh.vertices[shape.labels]  # the labels are where the vertices are
-    assert np.linalg.norm(there - shape.mesh.vertices, axis=1).max() < 0.05
+    labelled = source.mesh.vertices[shape.labels]  # must be near the vertices
+    assert np.linalg.norm(labelled - shape.mesh.vertices, axis=1).max() < 0.05

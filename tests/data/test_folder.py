@@ -1,4 +1,4 @@
-"""Your own meshes in a folder: what is taken, in which order, and what is refused."""
+"""A folder of meshes: which files are used, in which order, and which are rejected."""
 
 import inspect
 from pathlib import Path
@@ -45,7 +45,7 @@ def test_meshes_come_with_the_labels_of_their_files(root):
     assert shape.template_size == 5
 
 
-def test_matches_are_sorted_within_a_pattern_and_never_doubled(root):
+def test_matches_are_sorted_within_a_pattern_and_never_repeated(root):
     assert folder(root, train=["a/*.off"]).names["train"] == ["a_0", "a_1", "a_2", "a_3"]
     data = folder(root, train=["b/*", "a/3.off", "a/*.off", "*/[02].off"])
     assert data.names["train"] == ["b_0", "a_3", "a_0", "a_1", "a_2"]
@@ -62,20 +62,20 @@ def test_a_split_can_be_listed_in_a_text_file(root, tmp_path):
         folder(root, val="val.txt")
 
 
-def test_a_name_with_brackets_is_a_name_first(root):
+def test_an_existing_file_name_with_brackets_is_no_pattern(root):
     (root / "[ab].off").write_text(PYRAMID)
     (root / "a.off").write_text(PYRAMID)
     assert folder(root, train=["[ab].off"], labels=None).names["train"] == ["[ab]"]
 
 
-def test_patterns_leave_out_labels_folders_and_hidden_files(root):
+def test_patterns_skip_labels_folders_and_hidden_files(root):
     (root / "a" / "._0.off").write_bytes(b"\0")
     (root / "a" / "folder.off").mkdir()
     assert folder(root, train=["a/*"]).names["train"] == ["a_0", "a_1", "a_2", "a_3"]
 
 
 @pytest.mark.parametrize("labels", ["identity", None])
-def test_identity_means_the_template_s_numbering(root, labels):
+def test_identity_gives_vertex_i_the_label_i(root, labels):
     (root / "bent.off").write_text(PYRAMID.replace("0 0 1", "0 1 1"))
     data = folder(root, test=["bent.off", "a/0.off"], labels=labels)
     assert data.load("bent").labels.tolist() == [0, 1, 2, 3, 4]
@@ -83,7 +83,7 @@ def test_identity_means_the_template_s_numbering(root, labels):
         data.load("a_0")
 
 
-def test_labels_may_be_arrays_and_lie_in_another_folder(root):
+def test_labels_can_be_npy_files_in_another_folder(root):
     (root / "labels").mkdir()
     np.save(root / "labels" / "0_match.npy", np.array([4, 3, 2, 1], dtype=np.uint16))
     data = folder(root, test=["a/0.off"], labels="../labels/{stem}_match.npy")
@@ -102,7 +102,7 @@ def test_labels_may_be_arrays_and_lie_in_another_folder(root):
         (b"PK\x03\x04 cut short", r"not a readable \.npy"),
     ],
 )
-def test_a_wrong_array_is_refused_by_name(root, array, message):
+def test_an_invalid_label_array_is_rejected_by_name(root, array, message):
     if isinstance(array, bytes):
         (root / "a" / "0.npy").write_bytes(array)
     else:
@@ -111,7 +111,7 @@ def test_a_wrong_array_is_refused_by_name(root, array, message):
         folder(root, test=["a/0.off"], labels="{stem}.npy").load("a_0")
 
 
-def test_an_archive_of_arrays_is_no_array(root):
+def test_an_archive_of_arrays_is_rejected(root):
     with (root / "a" / "0.npy").open("wb") as file:
         np.savez(file, labels=np.arange(4))
     with pytest.raises(DataError, match=r"a/0\.npy: labels must be integers"):
@@ -126,13 +126,13 @@ def test_text_labels_from_windows_are_read(tmp_path):
 
 def test_a_missing_label_file_is_named_before_anything_is_read(root):
     (root / "a" / "1.txt").unlink()
-    with pytest.raises(DataError, match=r"a/1\.txt: 1\.off needs this label file"):
+    with pytest.raises(DataError, match=r"a/1\.txt does not exist; 1\.off needs this label file"):
         folder(root, train=["a/*.off"])
     with pytest.raises(DataError, match=r"a/1\.txt: cannot read the labels"):
         read_labels(root / "a" / "1.txt")
 
 
-def test_a_mesh_in_two_splits_is_refused(root):
+def test_a_mesh_in_two_splits_is_rejected(root):
     with pytest.raises(DataError, match=r"a/2\.off is in train and in test"):
         folder(root, train=["a/*.off"], test=["b/0.off", "a/2.off"])
     (root / "b" / "alias.off").symlink_to(root / "a" / "2.off")
@@ -140,9 +140,9 @@ def test_a_mesh_in_two_splits_is_refused(root):
         folder(root, train=["a/2.off"], val=["b/alias.off"], labels="identity")
 
 
-def test_two_meshes_of_one_name_are_refused(root):
+def test_two_meshes_of_the_same_name_are_rejected(root):
     (root / "a_0.off").write_text(PYRAMID)
-    with pytest.raises(DataError, match=r"a/0\.off and .*a_0\.off would both be called a_0"):
+    with pytest.raises(DataError, match=r"a/0\.off and .*a_0\.off would both be named a_0"):
         folder(root, train=["a/0.off"], val=["a_0.off"], labels="identity")
 
 
@@ -155,7 +155,7 @@ def test_an_entry_that_matches_nothing_is_named(root, entry):
 
 @pytest.mark.parametrize("where", ["list", "file", "template"])
 @pytest.mark.parametrize("entry", ["../outside.off", "a/../../*.off", "a/../b/0.off", "/absolute"])
-def test_paths_that_climb_or_are_absolute_are_refused(root, entry, where):
+def test_absolute_paths_and_paths_with_dots_are_rejected(root, entry, where):
     (root.parent / "outside.off").write_text(PYRAMID)
     (root / "train.txt").write_text(entry)
     with pytest.raises(DataError, match=r"must be relative to .* without"):
@@ -165,12 +165,12 @@ def test_paths_that_climb_or_are_absolute_are_refused(root, entry, where):
             folder(root, train=[entry] if where == "list" else "train.txt", labels="identity")
 
 
-def test_absolute_paths_into_the_folder_are_refused_too(root):
+def test_absolute_paths_into_the_folder_are_rejected_too(root):
     with pytest.raises(DataError, match="must be relative to"):
         folder(root, train=[str(root / "a" / "0.off")])
 
 
-def test_links_and_labels_that_lead_outside_are_refused(root):
+def test_links_and_labels_outside_the_folder_are_rejected(root):
     outside = root.parent / "outside"
     outside.mkdir()
     (outside / "0.off").write_text(PYRAMID)
@@ -179,24 +179,24 @@ def test_links_and_labels_that_lead_outside_are_refused(root):
     (root / "linked").symlink_to(outside)
     (root / "a" / "out.txt").symlink_to(outside / "0.txt")
     for entry in ["link.off", "l*.off", "linked/0.off", "linked/*.off"]:
-        with pytest.raises(DataError, match="leads out of"):
+        with pytest.raises(DataError, match="must be inside"):
             folder(root, train=[entry], labels="identity")
     for labels in ["../../outside/{stem}.txt", str(outside / "{stem}.txt"), "out.txt"]:
-        with pytest.raises(DataError, match="leads out of"):
+        with pytest.raises(DataError, match="must be inside"):
             folder(root, train=["a/0.off"], labels=labels)
 
 
-def test_a_folder_that_is_not_described_is_refused(root):
+def test_an_incomplete_or_wrong_description_is_rejected(root):
     for arguments in [(None, "template.off"), (root, None)]:
         with pytest.raises(DataError, match=r"needs data\.root=.* and data\.template="):
             Folder(*arguments, **NONE)
-    with pytest.raises(DataError, match="nothing is not a folder"):
+    with pytest.raises(DataError, match=r"data\.root must be a folder, got .*nothing"):
         folder(root / "nothing", train=["*"])
     with pytest.raises(DataError, match="all empty"):
         Folder(root, "template.off", train=None, val=[], test=None)
-    with pytest.raises(DataError, match=r"data\.template: 'a/\*\.off' matches 4 meshes"):
+    with pytest.raises(DataError, match=r"must match one mesh; 'a/\*\.off' matches 4 meshes"):
         Folder(root, "a/*.off", **NONE)
-    with pytest.raises(DataError, match="no mesh is called 'c'"):
+    with pytest.raises(DataError, match="no mesh is named 'c'"):
         folder(root, train=["a/0.off"]).load("c")
 
 

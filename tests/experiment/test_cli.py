@@ -2,51 +2,25 @@
 
 from __future__ import annotations
 
+import importlib
 import json
 import re
-import signal
-import sys
 
 import pytest
 import torch
-from hydra.core.global_hydra import GlobalHydra
 from omegaconf import OmegaConf
 
-from meshspiral.commands.train import main
-from meshspiral.experiment.runs import write_metrics
-from meshspiral.experiment.schema import ConfigError
-from meshspiral.experiment.sweeps import announce, job_folder
-from tests.commands.test_train import ROOT, composed
-
-
-@pytest.fixture
-def cli(monkeypatch, tmp_path, capfd):
-    """Run the program in this process; returns (exit code, stdout, stderr)."""
-    import logging
-
-    def call(*arguments: str, program=main):
-        GlobalHydra.instance().clear()
-        handlers = {s: signal.getsignal(s) for s in (signal.SIGINT, signal.SIGTERM)}
-        root = logging.getLogger()
-        before = root.handlers[:], root.level
-        monkeypatch.setattr(sys, "argv", ["src.train", *arguments])
-        code = 0
-        try:
-            program()
-        except SystemExit as stop:
-            code = stop.code or 0
-        finally:
-            for signum, handler in handlers.items():
-                signal.signal(signum, handler)
-            root.handlers, root.level = before
-            GlobalHydra.instance().clear()
-        return code, *capfd.readouterr()
-
-    monkeypatch.chdir(tmp_path)
-    return call
-
-
-QUICK = ["optim.epochs=1"]
+from meshspiral.data.settings import RemeshSettings, ShotSettings
+from meshspiral.evaluation.run_folder import write_metrics
+from meshspiral.experiment.help import COMMANDS
+from meshspiral.experiment.schema import (
+    GROUPS,
+    ConfigError,
+    OptimSettings,
+    TrainerSettings,
+)
+from meshspiral.experiment.sweeps import invocation, job_folder
+from tests.helpers import QUICK, ROOT, composed
 
 
 def test_the_documented_line_works_word_for_word(cli, toy_overrides, tmp_path):
@@ -70,10 +44,10 @@ def test_the_documented_line_works_word_for_word(cli, toy_overrides, tmp_path):
 
 
 def test_the_documented_sweep_works(cli, toy_overrides, tmp_path, monkeypatch):
-    """Which runs it has; what a run does has tests of its own."""
-    figures = {"test/exact_match": 0.0, "test/geodesic_error": 0.0}
+    """Which runs it has; other tests check what a run does."""
+    metrics = {"test/exact_match": 0.0, "test/geodesic_error": 0.0}
     monkeypatch.setattr(
-        "meshspiral.commands.train.train", lambda config, folder: write_metrics(folder, figures)
+        "meshspiral.training.run.train", lambda config, folder: write_metrics(folder, metrics)
     )
     toy = [o for o in toy_overrides if not o.startswith(("seq_len", "data.cache_dir"))]
     sweep = ["-m", "model=lstm,fcs", "seq_len=5,6", "+metric=true,false"]
@@ -126,39 +100,67 @@ def test_the_root_metric_wins_over_what_an_experiment_sets_of_the_model():
 @pytest.mark.parametrize(
     "arguments, message",
     [
-        (["+metric=maybe"], "metric=maybe: Value 'maybe' is not a valid bool"),
-        (["seq_len=0"], "seq_len must be at least 1; got 0"),
-        (["seq_len=many"], "seq_len=many: Value 'many' of type 'str' could not be converted"),
+        (["+metric=maybe"], "metric must be true or false, got maybe"),
+        (["seq_len=0"], "seq_len must be at least 1, got 0"),
+        (["seq_len=many"], "seq_len must be a whole number, got many"),
         (["model=foo"], "Could not find 'model/foo'; there are: fcs, gcnn3, lstm"),
         (["data=foo"], "there are: bodies, bodies_6890, bodies_6890_remeshed, bodies_mixed,"),
         (["+metrics=true"], "unknown key metrics; did you mean metric?"),
         (["+rate=1"], "unknown key rate; known: seq_len"),
         (["metrics=true"], "Could not override 'metrics'"),
-        (["model.dropout=1.5"], "model.dropout must be in 0..1"),
-        (["model.metric_layers=some"], "model.metric_layers must be one of all, first; got some"),
+        (["model.dropout=1.5"], "model.dropout must be below 1, got 1.5"),
+        (["model.metric_layers=some"], "model.metric_layers must be one of all, first, got some"),
         (["+model.depth=3"], "unknown key model.depth"),
-        (["optim.lr=-1"], "optim.lr must be above 0; got -1"),
-        (["model=gcnn3", "+metric=true"], "metric=true needs a model with spirals"),
-        (["model=gcnn3", "model.patch.rays=15"], "model.patch.rays must be even and at least 2"),
-        (["model=gcnn3", "model.patch.radius=0"], "model.patch.radius must be above 0; got 0"),
-        (["model=gcnn3", "model.patch.weights=flat"], "must be one of interpolation, gaussian"),
-        (["model=gcnn3", "model.patch=null"], "model.patch is a group of settings; got None"),
-        (["model=gcnn3", "+model.patch.sectors=8"], "unknown key model.patch.sectors"),
+        (["model.rings=2"], "model.rings is neighbourhood.rings now"),
+        (["+model.rings=2"], "unknown key model.rings; it is neighbourhood.rings now"),
+        (["model=gcnn3", "model.patch.radius=1"], "model.patch is a setting of neighbourhood now"),
+        (["neighbourhood.rings=1"], "fcs needs sequences of one length, got spirals of 1 rings"),
+        (
+            ["neighbourhood=patch"],
+            "model fcs needs a neighbourhood that gives spirals (spiral), got neighbourhood patch",
+        ),
+        (["model.channels=[1,2,0]"], "model.channels must be three numbers of at least 1"),
+        (["model.channels=[1,2,x]"], "model.channels must be a whole number, got x"),
+        (["neighbourhood=foo"], "Could not find 'neighbourhood/foo'; there are: patch, spiral"),
+        (["plugins=[no_such.module]"], "plugins: cannot import no_such.module (ModuleNotFound"),
+        (["plugins=5"], "plugins must be a list of modules, got 5"),
+        (["optim.lr=-1"], "optim.lr must be above 0, got -1"),
+        (
+            ["model=gcnn3", "+metric=true"],
+            "metric=true needs a model that reads metric information, got model gcnn3",
+        ),
+        (["model=gcnn3", "neighbourhood.rays=15"], "neighbourhood.rays must be even, got 15"),
+        (["model=gcnn3", "neighbourhood.radius=0"], "neighbourhood.radius must be above 0, got 0"),
+        (["model=gcnn3", "neighbourhood.weights=flat"], "must be one of interpolation, gaussian"),
+        (["neighbourhood=null"], "Config group override must be a string or a list"),
+        (["model=gcnn3", "+neighbourhood.sectors=8"], "unknown key neighbourhood.sectors"),
         (["optim.betas=[2,3]"], "optim.betas must be two numbers in 0..1"),
         (["optim.betas=[0.9]"], "optim.betas must be two numbers in 0..1"),
-        (["optim=5"], "optim is a group of settings; got 5"),
-        (["data.shot=5"], "data.shot is a group of settings; got 5"),
-        (["data=folder", "data.train=5"], "data.train must be file names or patterns; got 5"),
-        (["optim.epochs=1", "trainer.val_every=2"], "trainer.val_every must be at most"),
-        (["optim.epochs=0"], "optim.epochs must be at least 1; got 0"),
+        (["optim=5"], "optim must be a group of settings, got 5"),
+        (["data.shot=5"], "data.shot must be a group of settings, got 5"),
+        (["data=folder", "data.train=5"], "data.train must be file names or patterns, got 5"),
+        (
+            ["optim.epochs=1", "trainer.val_every=2"],
+            "trainer.val_every must be at most optim.epochs (1), got 2",
+        ),
+        (["optim.epochs=0"], "optim.epochs must be at least 1, got 0"),
         (["data.shot.radius=0"], "data.shot.radius must be above 0"),
-        (["data.shuffle_vertices=perhaps"], "data.shuffle_vertices=perhaps: Value 'perhaps'"),
-        (["trainer.precision=8"], "trainer.precision must be one of 32, 64, bf16, auto; got 8"),
-        (["model.channels=[1,2]"], "model.channels must hold three numbers of at least 1"),
+        (
+            ["data.shuffle_vertices=perhaps"],
+            "data.shuffle_vertices must be true or false, got perhaps",
+        ),
+        (["trainer.precision=8"], "trainer.precision must be one of 32, 64, bf16, auto, got 8"),
+        (
+            ["model.channels=[1,2]"],
+            "model.channels must be three numbers of at least 1, got [1, 2]",
+        ),
         (["data=faust"], "data.root"),
-        (["data=folder", "data.root=/none", "data.template=t.ply"], "/none is not a folder"),
+        (
+            ["data=folder", "data.root=/none", "data.template=t.ply"],
+            "data.root must be a folder, got /none",
+        ),
         (["data.vertices=12"], "1500"),
-        (["seed=99999999999"], "seed must be below 4294967296; got 99999999999"),
+        (["seed=99999999999"], "seed must be below 4294967296, got 99999999999"),
         (["resume=nowhere"], "resume=nowhere: is not a folder"),
         (["optim.lr=", "x y"], "x y"),
         (["hydra.run.dir=/dev/null/run"], "/dev/null"),
@@ -186,22 +188,45 @@ def test_a_device_that_is_not_there_is_one_clear_line(cli, toy_overrides, overri
     assert "Traceback" not in out + err
 
 
-def test_help_shows_groups_root_keys_and_three_commands(cli):
+def test_help_shows_groups_settings_and_three_commands(cli):
     code, out, _ = cli("--help")
     assert code == 0
-    for word in (
-        "model: fcs, gcnn3, lstm",
-        "data: bodies",
-        "trainer: cpu, ddp, gpu",
-        "seq_len",
-        "metric",
-        "seed",
-        "resume",
-        "experiment",
+    lines = [" ".join(line.split()) for line in out.splitlines()]
+    for line in (
+        "model fcs, gcnn3, lstm",
+        "neighbourhood patch, spiral",
+        "trainer cpu, ddp, gpu",
+        "data/remesh isotropic, mixed",
+        "seq_len number of vertices N of a spiral",
+        "optim.lr largest learning rate",
+        "model.metric read metric information: distance and angle (fcs, lstm)",
+        "neighbourhood.rays number of rays of the polar grid, even (patch)",
+        "data.vertices vertices of the template and the bodies (bodies)",
     ):
-        assert word in out
-    commands = [line.strip() for line in out.splitlines() if line.strip().startswith("python -m")]
-    assert len(commands) >= 3
+        assert line in lines
+    assert len([line for line in lines if line.startswith("python -m")]) >= 3
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_help_of_a_command_names_its_settings_and_no_internal_group(cli, command):
+    code, out, _ = cli(
+        "--help", program=importlib.import_module(f"meshspiral.commands.{command}").main
+    )
+    assert code == 0 and f"python -m src.{command}" in out
+    lines = [line.split() for line in out.splitlines() if line.strip()]
+    settings = {words[0] for words in lines}
+    declared = COMMANDS[command].model_fields
+    assert {name for name, field in declared.items() if field.description} <= settings
+    assert "cli" not in settings
+
+
+def test_every_setting_has_a_help_text():
+    schemas = [*COMMANDS.values(), OptimSettings, TrainerSettings, ShotSettings, RemeshSettings]
+    schemas += [cls.Settings for base in GROUPS.values() for cls in base.registered.values()]
+    for schema in schemas:
+        for name, field in schema.model_fields.items():
+            group = name in ("name", "model", "neighbourhood", "data", "shot", "trainer", "optim")
+            assert field.description or group, f"{schema.__qualname__}.{name}"
 
 
 def test_the_documented_commands_compose():
@@ -226,17 +251,16 @@ def test_a_failing_job_of_a_sweep_says_why_in_its_log_and_the_others_run(
     code, out, err = cli("-m", "optim.lr=0,0.01", *toy_overrides, *QUICK, "hydra.sweep.dir=sweep")
     assert code == 1
     failed, done = (tmp_path / "sweep" / f"optim.lr-{lr}" for lr in ("0", "0.01"))
-    assert "error: optim.lr must be above 0; got 0" in (failed / "train.log").read_text()
+    assert "error: optim.lr must be above 0, got 0" in (failed / "train.log").read_text()
     assert (done / "metrics.json").is_file() and not (failed / "metrics.json").exists()
     assert "Traceback" not in out + err
 
 
-def test_jobs_never_share_a_folder(monkeypatch):
+def test_jobs_never_share_a_folder():
     """Also where a name had to lose what tells two of them apart."""
     values = ["[train/*.ply]", "[train/?.ply]", "/a/b", "a/b", "x" * 300, "x" * 301, "1", "2"]
-    monkeypatch.setattr(sys, "argv", ["src.train", "-m", "seq_len=8", "data.root=1,2"])
-    announce()
-    names = [job_folder(["seq_len=8", f"data.root={value}"], 0) for value in values]
+    with invocation(["-m", "seq_len=8", "data.root=1,2"]):
+        names = [job_folder(["seq_len=8", f"data.root={value}"], 0) for value in values]
     assert len(set(names)) == len(values)
     assert names[-2:] == ["data.root-1", "data.root-2"]
     assert all(re.fullmatch(r"[\w.+-]{1,130}", name) for name in names)
@@ -249,11 +273,11 @@ def test_a_folder_with_another_run_is_left_alone(cli, toy_overrides, tmp_path):
     assert cli(*folder, *QUICK)[0] == 0
     before = (tmp_path / "run" / "config.yaml").read_text()
     code, out, err = cli(*folder, *QUICK, "seed=7")
-    assert code == 1 and "run holds another run (seed differ)" in out + err
+    assert code == 1 and "run holds another run, whose seed differ" in out + err
     assert (tmp_path / "run" / "config.yaml").read_text() == before
     assert cli(*folder, *QUICK)[0] == 0  # the same run again: nothing left to do
 
 
 def test_config_errors_name_the_key():
-    with pytest.raises(ConfigError, match=r"trainer\.threads must be at least 1; got 0"):
+    with pytest.raises(ConfigError, match=r"trainer\.threads must be at least 1, got 0"):
         composed(["trainer.threads=0"])

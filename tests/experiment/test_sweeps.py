@@ -17,43 +17,25 @@ import pytest
 import torch
 from omegaconf import OmegaConf
 
-from meshspiral.commands.train import train_apart
-from meshspiral.experiment.runs import (
-    BEST,
-    CONFIG,
-    LAST,
-    METRICS,
-    InUse,
-    RunError,
-    Stopped,
-    alone,
-    claim,
-    write_metrics,
-)
+from meshspiral.commands.train import train_separately
+from meshspiral.evaluation.run_folder import BEST, CONFIG, LAST, METRICS, RunError, write_metrics
+from meshspiral.experiment.runs import InUse, alone, claim
 from meshspiral.experiment.sweeps import (
     FAILED,
-    announce,
-    legal_name,
+    invocation,
+    job_states,
     run_folder,
-    states,
     sweep_folder,
 )
 from meshspiral.training.callbacks import OrderlyStop
-from tests.commands.test_train import (
-    FIGURES,
-    ROOT,
-    composed,
-    program_process,
-    run,
-    wait_for,
-    weights,
-)
-from tests.experiment.test_cli import QUICK, cli  # noqa: F401
+from meshspiral.training.stopping import Stopped
+from tests import helpers
+from tests.helpers import QUICK, ROOT, composed, program_process, run, wait_for, weights
 
 SWEEP = ["-m", "seed=0,1,2", "optim.epochs=12"]
 
 
-def test_a_killed_sweep_does_what_is_left(cli, toy_overrides, tmp_path):  # noqa: F811
+def test_a_killed_sweep_does_what_is_left(cli, toy_overrides, tmp_path):
     toy = [o for o in toy_overrides if not o.startswith("optim")]
     command = [*SWEEP, *toy]
     env = {**os.environ, "PYTHONPATH": str(ROOT)}
@@ -71,7 +53,7 @@ def test_a_killed_sweep_does_what_is_left(cli, toy_overrides, tmp_path):  # noqa
     process.send_signal(signal.SIGKILL)
     process.wait()
     sweep = second[0].parents[2]
-    assert [(job, state) for job, state, _ in states(sweep)] == [
+    assert [(job, state) for job, state, _ in job_states(sweep)] == [
         ("seed-0", "finished"),
         ("seed-1", "stopped"),
     ]
@@ -79,17 +61,17 @@ def test_a_killed_sweep_does_what_is_left(cli, toy_overrides, tmp_path):  # noqa
 
     code, out, err = cli(*command)
     assert code == 0, err
-    assert [state for _, state, _ in states(sweep)] == 3 * ["finished"]
+    assert [state for _, state, _ in job_states(sweep)] == 3 * ["finished"]
     assert (sweep / "seed-0" / METRICS).stat().st_mtime_ns == first
     assert (
-        "finished before: " in out
+        "already finished: " in out
         and f"python -m src.report runs={sweep.relative_to(tmp_path)}" in out
     )
 
     more = [word.replace("0,1,2", "0,1,2,3") for word in command]
     code, out, err = cli(*more, f"hydra.sweep.dir={sweep}")
     assert code == 0, err
-    assert [job for job, *_ in states(sweep)] == ["seed-0", "seed-1", "seed-2", "seed-3"]
+    assert [job for job, *_ in job_states(sweep)] == ["seed-0", "seed-1", "seed-2", "seed-3"]
     assert (sweep / "seed-0" / METRICS).stat().st_mtime_ns == first
 
     whole = tmp_path / "whole"
@@ -98,7 +80,7 @@ def test_a_killed_sweep_does_what_is_left(cli, toy_overrides, tmp_path):  # noqa
     assert all((kept[key] == expected[key]).all() for key in expected)
 
 
-def test_what_failed_is_in_the_table_and_tried_again(cli, toy_overrides, monkeypatch):  # noqa: F811
+def test_what_failed_is_in_the_table_and_tried_again(cli, toy_overrides, monkeypatch):
     command = ["-m", "data.shot.bins=4,5", *toy_overrides, *QUICK]
     command = [word for word in command if word != "data.shot.bins=4"]
     from meshspiral.data import preprocessing
@@ -115,7 +97,7 @@ def test_what_failed_is_in_the_table_and_tried_again(cli, toy_overrides, monkeyp
         code, out, _ = cli(*command)
     assert code == 1
     [sweep] = Path("outputs/sweeps").iterdir()
-    assert [row[:2] for row in states(sweep)] == [
+    assert [row[:2] for row in job_states(sweep)] == [
         ("data.shot.bins-4", "finished"),
         ("data.shot.bins-5", "failed"),
     ]
@@ -124,37 +106,29 @@ def test_what_failed_is_in_the_table_and_tried_again(cli, toy_overrides, monkeyp
     code, out, err = cli(*command)
     assert code == 0, err
     assert not (sweep / "data.shot.bins-5" / FAILED).exists()
-    assert [state for _, state, _ in states(sweep)] == 2 * ["finished"]
+    assert [state for _, state, _ in job_states(sweep)] == 2 * ["finished"]
 
 
 def test_runs_of_one_second_get_folders_of_their_own(tmp_path):
     new = str(tmp_path / "12-00-00_fcs")
-    announce()
-    first = run_folder(None, new)
-    assert first == new == run_folder(None, new)  # Hydra asks again
-    announce()  # another command line
-    assert run_folder(None, new) == f"{new}_2"
-    assert run_folder(first, new) == first
+    with invocation([]):
+        first = run_folder(None, new)
+        assert first == new == run_folder(None, new)  # Hydra asks again
+    with invocation([]):  # another command line
+        assert run_folder(None, new) == f"{new}_2"
+        assert run_folder(first, new) == first
 
 
-def test_one_command_one_folder(monkeypatch):
+def test_one_command_one_folder():
     def folder(*words):
-        monkeypatch.setattr(sys, "argv", ["src.train", *words])
-        announce()
-        return sweep_folder()
+        with invocation(list(words)):
+            return sweep_folder()
 
     one = folder("-m", "seed=0,1", "+metric=true")
     assert one == folder("--multirun", "seed=0,1", "+metric=true", "hydra.job.name=x")
     assert one.startswith("seed-0-1_metric-true-")
     assert one != folder("-m", "seed=0-1", "+metric=true")
     assert folder("-m") == "sweep"
-
-
-@pytest.mark.parametrize("name", ["a/b", "a=b", "ü,*?", "x" * 500, "体" * 200])
-def test_names_are_legal_and_their_own(name):
-    legal = legal_name(name)
-    assert len(legal.encode()) < 140 and not set(legal) & set("/=,*?\\ ")
-    assert legal != legal_name(name + "1")
 
 
 @pytest.mark.parametrize("launcher", ["joblib", "submitit_local"])
@@ -176,7 +150,7 @@ def test_jobs_run_in_processes_of_their_own(toy_overrides, tmp_path, launcher):
         log = (sweep / "optim.lr-0.01" / "train.log").read_text()
         assert "32-true on cpu, 1 thread\n" in log
     assert "launcher" not in sweep.name
-    found = {job: state for job, state, _ in states(sweep)}
+    found = {job: state for job, state, _ in job_states(sweep)}
     assert found == {
         "optim.lr-0": "failed",
         "optim.lr-0.01": "finished",
@@ -224,16 +198,16 @@ def test_two_processes_measure_what_one_does(toy_overrides, tmp_path):
     )
     assert done.returncode == 0, done.stdout + done.stderr
     assert done.stdout.count("Test on 3 unseen meshes") == 1
-    assert [state for _, state, _ in states(tmp_path)] == ["finished"]
+    assert [state for _, state, _ in job_states(tmp_path)] == ["finished"]
     together = json.loads((tmp_path / "job" / METRICS).read_text())
-    with pytest.raises(RunError, match="of a run in 2 processes, this would be 1"):
+    with pytest.raises(RunError, match="of a run in 2 processes, not 1"):
         run(tmp_path / "job", [*toy_overrides, "optim.epochs=2"])
     for path in (tmp_path / "job" / LAST, tmp_path / "job" / BEST):
         saved = torch.load(path, weights_only=True)
         del saved["processes"]
         torch.save(saved, path)
     alone = run(tmp_path / "job", [*toy_overrides, "optim.epochs=2"])  # with the same weights
-    for name in sorted(FIGURES - {"seconds/preprocess", "seconds/train"}):
+    for name in sorted(helpers.METRICS - {"seconds/preprocess", "seconds/train"}):
         assert together[name] == pytest.approx(alone[name], rel=1e-5), name
 
 
@@ -244,7 +218,7 @@ def test_a_signal_to_one_process_of_several_stops_all(toy_overrides, tmp_path):
     process.send_signal(signal.SIGTERM)
     output, _ = process.communicate(timeout=60)  # of all of them: they share the pipe
     assert process.returncode == 143 and "Traceback" not in output, output
-    assert output.count(f"To go on: python -m src.train resume={tmp_path}") == 1
+    assert output.count(f"To resume: python -m src.train resume={tmp_path}") == 1
     torch.load(tmp_path / LAST, weights_only=True)
 
 
@@ -265,40 +239,40 @@ def test_a_signal_while_the_processes_agree_waits_for_the_next_step(tmp_path):
     assert stopped.value.signum == signal.SIGINT
 
 
-def test_a_job_at_which_another_process_is_is_left_to_it(cli, toy_overrides, tmp_path):  # noqa: F811
+def test_a_job_at_which_another_process_is_is_left_to_it(cli, toy_overrides, tmp_path):
     command = ["-m", "seed=0,1", *toy_overrides, *QUICK]
     sweep = tmp_path / "sweep"
     (sweep / "seed-0").mkdir(parents=True)
     with alone(sweep / "seed-0"):
         code, out, err = cli(*command, f"hydra.sweep.dir={sweep}")
         assert code == 0, err
-        assert "another process is at it: " in out and "seed-0  running" in out
+        assert "already running in another process: " in out and "seed-0  running" in out
         assert not (sweep / "seed-0" / METRICS).exists()
         assert (sweep / "seed-1" / METRICS).exists()
         code, out, err = cli(*toy_overrides, *QUICK, "seed=0", f"hydra.run.dir={sweep}/seed-0")
         assert code == 1 and "another process is training in" in out + err
     assert cli(*command, f"hydra.sweep.dir={sweep}")[0] == 0
-    assert [state for _, state, _ in states(sweep)] == 2 * ["finished"]
+    assert [state for _, state, _ in job_states(sweep)] == 2 * ["finished"]
 
 
 def test_a_job_of_several_processes_at_which_others_are_has_not_failed(tmp_path, monkeypatch):
     monkeypatch.setattr(sys, "executable", "false")  # what it runs ends with 1
     with alone(tmp_path), pytest.raises(InUse):
-        train_apart(tmp_path, [])
-    with pytest.raises(RunError, match=r"ended with exit code 1; why is in .*train\*.log"):
-        train_apart(tmp_path, [])
+        train_separately(tmp_path, [])
+    with pytest.raises(RunError, match=r"ended with exit code 1; see .*train\*\.log"):
+        train_separately(tmp_path, [])
 
 
-def test_a_run_with_other_settings_fails_but_what_is_finished_stays_so(cli, toy_overrides):  # noqa: F811
+def test_a_run_with_other_settings_fails_but_what_is_finished_stays_so(cli, toy_overrides):
     command = ["-m", "seed=0,1", *toy_overrides, "hydra.sweep.dir=sweep"]
     assert cli(*command, *QUICK)[0] == 0
     code, _, _ = cli(*command, "optim.epochs=2")
     assert code == 1
-    rows = states(Path("sweep"))
+    rows = job_states(Path("sweep"))
     assert [state for _, state, _ in rows] == 2 * ["finished"]
-    assert "but sweep/seed-0 holds another run (optim.epochs differ)" in rows[0][2]
+    assert "but sweep/seed-0 holds another run, whose optim.epochs differ" in rows[0][2]
     assert cli(*command, *QUICK)[0] == 0
-    assert "holds another run" not in states(Path("sweep"))[0][2]
+    assert "holds another run" not in job_states(Path("sweep"))[0][2]
 
 
 @pytest.fixture
@@ -335,10 +309,10 @@ def test_a_worker_that_is_killed_leaves_the_table_and_a_line(two_at_a_time, tmp_
     os.kill(int(worker.name), signal.SIGKILL)
     out, err = two_at_a_time.communicate(timeout=60)
     assert two_at_a_time.returncode == 1
-    assert out.count("goes on with the same command") == 2 and "Traceback" not in err
+    assert out.count("the same command resumes it") == 2 and "Traceback" not in err
     line = (
-        r"error: a job came to no end \(TerminatedWorkerError: .*; traceback in (.*)\); "
-        r"to go on: the same command\n"
+        r"error: a job crashed \(TerminatedWorkerError: .*; traceback in (.*)\); "
+        r"rerun the same command to resume\n"
     )
     [where] = re.findall(line, err)
     assert "TerminatedWorkerError" in (tmp_path / where).read_text()
@@ -348,27 +322,27 @@ def test_ctrl_c_in_a_launcher_says_how_to_go_on(two_at_a_time):
     two_at_a_time.send_signal(signal.SIGINT)
     _, err = two_at_a_time.communicate(timeout=60)
     assert two_at_a_time.returncode == 130
-    assert "Stopped. To go on: the same command" in err
+    assert "Stopped. To resume: rerun the same command" in err
 
 
-def test_a_run_whose_pictures_failed_is_not_finished(cli, toy_overrides, monkeypatch):  # noqa: F811
+def test_a_run_whose_pictures_failed_is_not_finished(cli, toy_overrides, monkeypatch):
     def full(*_):
         raise OSError(28, "No space left on device", "curve.png")
 
     command = ["-m", "seed=0", *toy_overrides, *QUICK]
     with monkeypatch.context() as broken:
-        broken.setattr("meshspiral.evaluation.summary.draw", full)
+        broken.setattr("meshspiral.evaluation.summary.write_plots", full)
         assert cli(*command)[0] == 1
     [sweep] = Path("outputs/sweeps").iterdir()
-    [row] = states(sweep)
+    [row] = job_states(sweep)
     assert row[1:] == ("failed", "curve.png: No space left on device")
     assert cli(*command)[0] == 0
-    [row] = states(sweep)
+    [row] = job_states(sweep)
     assert row[1] == "finished" and (sweep / row[0] / "curve.png").is_file()
 
 
 @pytest.mark.parametrize("launcher", ["joblib", "slurm", "submitit_local"])
-def test_the_launchers_have_configs(cli, launcher):  # noqa: F811
+def test_the_launchers_have_configs(cli, launcher):
     code, out, err = cli(f"hydra/launcher={launcher}", "--cfg", "hydra", "-p", "hydra.launcher")
     assert code == 0, err
     assert "_target_: hydra_plugins." in out
@@ -382,12 +356,12 @@ def test_the_launchers_have_configs(cli, launcher):  # noqa: F811
         ("rotations", {"model-fcs", "model-lstm"}),
         (
             "remeshed model=gcnn3 metric=false",
-            {"data.remesh.policy-isotropic", "data.remesh.policy-mixed"},
+            {"data.remesh-isotropic", "data.remesh-mixed"},
         ),
         (
             "remeshed",
             {
-                f"model-{m}_data.remesh.policy-{p}_metric-{x}"
+                f"model-{m}_data.remesh-{p}_metric-{x}"
                 for m in ("fcs", "lstm")
                 for p in ("isotropic", "mixed")
                 for x in ("true", "false")
@@ -416,11 +390,11 @@ def test_the_launchers_have_configs(cli, launcher):  # noqa: F811
     ],
 )
 @pytest.mark.parametrize("paper", [False, True])
-def test_the_paper_s_experiments_are_sweeps(cli, toy_overrides, monkeypatch, name, jobs, paper):  # noqa: F811
+def test_the_paper_s_experiments_are_sweeps(cli, toy_overrides, monkeypatch, name, jobs, paper):
     """Which jobs they are, with our settings or the paper's; what they do has its own tests."""
     figures = {"test/exact_match": 0.0, "test/geodesic_error": 0.0}
     monkeypatch.setattr(
-        "meshspiral.commands.train.train", lambda config, folder: write_metrics(folder, figures)
+        "meshspiral.training.run.train", lambda config, folder: write_metrics(folder, figures)
     )
     toy = [o for o in toy_overrides if not o.startswith(("seq_len", "data.shot"))]
     name, *words = name.split()
@@ -429,7 +403,9 @@ def test_the_paper_s_experiments_are_sweeps(cli, toy_overrides, monkeypatch, nam
     )
     assert code == 0, err
     [sweep] = Path("outputs/sweeps").iterdir()
-    assert {(job, state) for job, state, _ in states(sweep)} == {(job, "finished") for job in jobs}
+    assert {(job, state) for job, state, _ in job_states(sweep)} == {
+        (job, "finished") for job in jobs
+    }
     configs = [OmegaConf.load(sweep / job / CONFIG) for job in jobs]
     lengths = {15, 20, 30} if any("seq_len-" in job for job in jobs) else {30}
     assert {c.seq_len for c in configs} == lengths

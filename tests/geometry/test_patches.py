@@ -1,4 +1,6 @@
-"""Geodesic polar patches: against the plane, the sphere, a log map, a second implementation."""
+"""Geodesic polar patches agree with closed forms, log maps and a second implementation."""
+
+from __future__ import annotations
 
 import numpy as np
 import potpourri3d
@@ -13,7 +15,7 @@ from meshspiral.geometry.patches import PatchTable, geodesic_patches
 from tests.meshes import bow_tie, bumpy_sphere, lattice, punctured, torus, two_cones, union
 
 TURN = 2 * np.pi
-DISTANCES = np.arange(1, 6)[:, None] / 5  # of the five rings, in radii
+DISTANCES = np.arange(1, 6)[:, None] / 5  # of the five rings, in units of the radius
 ANGLES = np.arange(16) * TURN / 16  # of the sixteen rays, from the first
 
 
@@ -23,9 +25,9 @@ def icosphere(subdivisions: int) -> Mesh:
 
 
 def scattered_square(count: int, seed: int) -> Mesh:
-    """The Delaunay triangulation of random points in the unit square, seen from +z.
+    """A Delaunay triangulation of random points in the unit square, facing +z.
 
-    The first four vertices are the corners, the next forty lie on the sides.
+    The first four vertices are the corners; the next forty lie on the sides.
     """
     rng = np.random.default_rng(seed)
     t, zero, one = rng.uniform(0.02, 0.98, (4, 10)), np.zeros(10), np.ones(10)
@@ -54,8 +56,11 @@ def tetrahedron() -> Mesh:
 
 
 def split_vertex(mesh: Mesh, v: int, begin: int = 0, end: int = 3) -> Mesh:
-    """The faces of v from its begin-th to its end-th neighbour are given to a new vertex, the last
-    one, at the same point; two zero-area faces between v and the new vertex close the gap."""
+    """The mesh with a duplicate of v as its last vertex.
+
+    The duplicate gets the faces of v from its begin-th to its end-th neighbour. Two zero-area faces
+    between v and the duplicate close the gap.
+    """
     neighbours, first = one_rings(mesh)
     ring = neighbours[first[v] : first[v + 1]][::-1].tolist()
     new, faces = len(mesh.vertices), mesh.faces.copy()
@@ -67,8 +72,10 @@ def split_vertex(mesh: Mesh, v: int, begin: int = 0, end: int = 3) -> Mesh:
 
 
 def filled_edge(mesh: Mesh, face: int) -> Mesh:
-    """One face is halved by a new vertex, the last one, in the middle of its first edge, but its
-    neighbour is not: a zero-area face of three points in a line fills the gap."""
+    """The mesh with one face halved by a new last vertex, in the middle of its first edge.
+
+    Its neighbour is not halved: a zero-area face of three collinear points fills the gap.
+    """
     a, b, c = mesh.faces[face]
     middle, new, faces = (mesh.vertices[a] + mesh.vertices[b]) / 2, len(mesh.vertices), mesh.faces
     faces = np.vstack([faces[:face], [[a, new, c]], faces[face + 1 :], [[new, b, c], [a, b, new]]])
@@ -76,7 +83,7 @@ def filled_edge(mesh: Mesh, face: int) -> Mesh:
 
 
 def shuffled(mesh: Mesh, seed: int) -> tuple[Mesh, np.ndarray]:
-    """The same surface, vertices and faces in another order, and the old number of each vertex."""
+    """The surface with vertices and faces in random order, and the old number of each vertex."""
     rng = np.random.default_rng(seed)
     order = rng.permutation(len(mesh.vertices))
     other = mesh.renumbered(order)
@@ -84,12 +91,13 @@ def shuffled(mesh: Mesh, seed: int) -> tuple[Mesh, np.ndarray]:
 
 
 def rolled(mesh: Mesh, seed: int) -> Mesh:
-    """Every face begins with another of its corners."""
+    """The mesh with the corners of every face rotated at random."""
     turn = np.random.default_rng(seed).integers(0, 3, (len(mesh.faces), 1))
     return Mesh(mesh.vertices, np.take_along_axis(mesh.faces, (turn + np.arange(3)) % 3, 1))
 
 
 def body() -> Mesh:
+    """A human body."""
     bodies = Bodies(vertices=1500)
     return bodies.load(bodies.names["train"][2]).mesh
 
@@ -117,26 +125,28 @@ every_mesh = pytest.mark.parametrize("mesh", (CLOSED | OPEN).values(), ids=CLOSE
 
 
 def size(mesh: Mesh) -> float:
+    """The longest side of the bounding box."""
     return float(np.ptp(mesh.vertices, axis=0).max())
 
 
-def interpolated(values: np.ndarray, table: PatchTable) -> np.ndarray:
-    """[V, rings, rays, N]: `values` [V, N] at the samples, NaN where there is none."""
+def sampled(values: np.ndarray, table: PatchTable) -> np.ndarray:
+    """Values [V, N] at the samples, [V, rings, rays, N]; NaN at missing samples."""
     at = np.einsum("...k,...kn->...n", table.weights.astype(float), values[table.indices])
     return np.where(table.whole[..., None], at, np.nan)
 
 
 def sample_points(mesh: Mesh, table: PatchTable) -> np.ndarray:
-    return interpolated(mesh.vertices, table)
+    """The coordinates of the samples, [V, rings, rays, 3]; NaN at missing samples."""
+    return sampled(mesh.vertices, table)
 
 
 def wrapped(angles: np.ndarray) -> np.ndarray:
-    """The same angles, between -pi and pi."""
+    """The same angles, from -pi to pi."""
     return (angles + np.pi) % TURN - np.pi
 
 
 def assert_sound(mesh: Mesh, table: PatchTable) -> None:
-    """What holds of every table: a sample is whole and on the surface, or it is empty."""
+    """Check what holds for every table: a sample lies in a face, or it is missing."""
     indices, weights = table
     assert indices.min(initial=0) >= 0 and indices.max(initial=0) < len(mesh.vertices)
     assert np.isfinite(weights).all() and weights.min(initial=0) >= 0
@@ -144,8 +154,8 @@ def assert_sound(mesh: Mesh, table: PatchTable) -> None:
     np.testing.assert_array_equal(table.whole, whole)
     np.testing.assert_allclose(weights[whole].sum(-1), 1, rtol=0, atol=1e-5)
     assert (indices[~whole] == 0).all()
-    assert not (whole[:, 1:] & ~whole[:, :-1]).any()  # off the surface, a ray does not come back
-    number = len(mesh.vertices) ** np.arange(3)  # one for each set of three vertices
+    assert not (whole[:, 1:] & ~whole[:, :-1]).any()  # a ray that left does not return
+    number = len(mesh.vertices) ** np.arange(3)  # unique for each set of three vertices
     assert np.isin(np.sort(indices[whole], 1) @ number, np.sort(mesh.faces, 1) @ number).all()
 
 
@@ -153,8 +163,10 @@ def assert_sound(mesh: Mesh, table: PatchTable) -> None:
 
 
 def flat_grid_angles(mesh: Mesh, table: PatchTable, radius: float, centers) -> np.ndarray:
-    """The directions of the first rays of `centers` on a mesh in the plane z = 0, checked: their
-    samples, all there, are polar grids, counter-clockwise as seen from +z."""
+    """The directions of the first rays of `centers`, on a mesh in the plane z = 0.
+
+    Checks that all samples exist and form polar grids, counter-clockwise as seen from +z.
+    """
     assert table.whole[centers].all()
     step = sample_points(mesh, table)[centers] - mesh.vertices[centers, None, None]
     distance, angle = np.hypot(step[..., 0], step[..., 1]), np.arctan2(step[..., 1], step[..., 0])
@@ -174,21 +186,21 @@ def test_on_an_irregular_flat_mesh_the_samples_are_a_polar_grid(radius):
     neighbours, first = one_rings(mesh)
     for v, zero in zip(inner, angles - TURN / 32, strict=True):
         x, y = (xy[neighbours[first[v] : first[v + 1]]] - xy[v]).T
-        assert np.abs(wrapped(np.arctan2(y, x) - zero)).min() < 1e-4  # some neighbour is there
+        assert np.abs(wrapped(np.arctan2(y, x) - zero)).min() < 1e-4  # at some neighbour
 
 
 @pytest.mark.parametrize("rays", [1, 2, 3, 6])
-def test_a_ray_that_meets_vertices_or_follows_edges_goes_straight_on(rays):
+def test_a_ray_through_vertices_or_along_edges_goes_straight_on(rays):
     flat = mesh = lattice(15, 15)
     for v in [15 * i + j for i in (4, 6, 8, 10) for j in (3, 6, 9)]:
-        mesh = split_vertex(mesh, v, v % 3, v % 3 + 3)  # two in one point
+        mesh = split_vertex(mesh, v, v % 3, v % 3 + 3)  # two vertices at one point
     centers = [15 * i + j for i in (5, 7, 9) for j in (5, 6, 7, 8)]
     for radius in (0.7, 3.0):
         flat_grid_angles(flat, geodesic_patches(flat, radius, rays=rays), radius, centers)
         flat_grid_angles(mesh, geodesic_patches(mesh, radius, rays=rays), radius, centers)
 
 
-def test_in_a_square_a_ray_ends_where_it_meets_a_side():
+def test_in_a_square_a_ray_ends_at_the_side_that_it_meets():
     mesh = scattered_square(100, 2)
     radius = 0.731
     table = geodesic_patches(mesh, radius)
@@ -203,7 +215,7 @@ def test_in_a_square_a_ray_ends_where_it_meets_a_side():
     assert ends > 500
 
 
-def test_at_a_side_half_of_the_rays_stay_and_at_a_corner_a_quarter():
+def test_at_a_side_half_of_the_rays_have_samples_and_at_a_corner_a_quarter():
     mesh = scattered_square(100, 2)
     radius = 1e-3
     table = geodesic_patches(mesh, radius)
@@ -211,7 +223,7 @@ def test_at_a_side_half_of_the_rays_stay_and_at_a_corner_a_quarter():
     for v in range(4 + 40):
         rays, quarter = (4, v) if v < 4 else (8, (v - 4) // 10)
         assert whole[v, :, :rays].all() and not whole[v, :, rays:].any()
-        # from the last edge clockwise: along the lower side to the right, up the right side, ...
+        # from the last edge clockwise: along the lower side, up the right side, ...
         angle = quarter * TURN / 4 + TURN / 32 + ANGLES[:rays]
         ray = np.stack([np.cos(angle), np.sin(angle), 0 * angle], 1)
         expected = mesh.vertices[v] + radius * DISTANCES[..., None] * ray
@@ -254,15 +266,18 @@ def test_on_a_sphere_the_rays_are_great_circles(radius):
 
 
 def log_map_errors(log: np.ndarray, table: PatchTable, radius: float, v: int) -> tuple:
-    """By how much the samples of v differ from its log map [V, 2], each [rings, rays]: in distance,
-    in radii, and in direction, wherever the log map has its zero."""
-    x, y = np.moveaxis(interpolated(log, PatchTable(*(part[[v]] for part in table)))[0], -1, 0)
+    """The differences between the samples of v and its log map [V, 2], each [rings, rays].
+
+    They are the difference in distance, in units of the radius, and in direction, up to the zero
+    direction of the log map.
+    """
+    x, y = np.moveaxis(sampled(log, PatchTable(*(part[[v]] for part in table)))[0], -1, 0)
     turned = np.exp(1j * (np.arctan2(y, x) - ANGLES))
     return np.abs(np.hypot(x, y) / radius - DISTANCES), np.abs(np.angle(turned / turned.mean()))
 
 
 @pytest.mark.parametrize("seed", [0, 3])
-def test_on_a_curved_surface_the_samples_are_where_the_log_map_says(seed):
+def test_on_a_curved_surface_the_samples_agree_with_the_log_map(seed):
     mesh = bumpy_sphere(seed, subdivisions=4)
     radius = 0.2 * np.sqrt(mesh.area)
     table = geodesic_patches(mesh, radius)
@@ -274,7 +289,7 @@ def test_on_a_curved_surface_the_samples_are_where_the_log_map_says(seed):
         assert angle.mean() < 0.015 and angle.max() < 0.08
 
 
-def test_on_a_flat_mesh_the_samples_are_exactly_where_the_log_map_says():
+def test_on_a_flat_mesh_the_samples_agree_exactly_with_the_log_map():
     mesh = scattered_square(400, 0)
     table = geodesic_patches(mesh, 0.2)
     solver = potpourri3d.MeshVectorHeatSolver(mesh.vertices, mesh.faces, 0.05)
@@ -285,12 +300,15 @@ def test_on_a_flat_mesh_the_samples_are_exactly_where_the_log_map_says():
         assert distance.max() < 1e-4 and angle.max() < 1e-4
 
 
-# --------------------------------------------------------------- a second, plain implementation
+# ---------------------------------------------------------- a second, literal implementation
 
 
 def half_edges(mesh: Mesh) -> dict:
-    """Of every directed edge, the face on its left: the third vertex, the unit vector along the
-    edge, and the one out of the face."""
+    """For every directed edge, three properties of the face on its left.
+
+    They are the third vertex, the unit vector along the edge, and the unit vector in the plane of
+    the face that points out of it across the edge.
+    """
     out = {}
     for face, normal in zip(mesh.faces.tolist(), mesh.face_normals, strict=True):
         for i in range(3):
@@ -302,9 +320,14 @@ def half_edges(mesh: Mesh) -> dict:
 
 
 def walk(mesh: Mesh, halves: dict, v: int, x: int, angle: float, distances) -> tuple:
-    """Walk from v, at `angle` to the edge to x, in space: at every edge the direction turns about
-    the edge into the next face. The points at the distances, NaN behind the boundary; and how
-    close to a vertex the walk has come."""
+    """Walk straight on from v in space, at `angle` to the edge to x.
+
+    At every edge the direction is rotated about the edge into the next face.
+
+    Returns:
+        The points at the distances, NaN behind the boundary; and the smallest distance of the walk
+        from a vertex.
+    """
     points, done = np.full((len(distances), 3), np.nan), 0
     third, along, outward = halves[v, x]
     direction = np.cos(angle) * along - np.sin(angle) * outward
@@ -333,7 +356,7 @@ def walk(mesh: Mesh, halves: dict, v: int, x: int, angle: float, distances) -> t
 
 
 def walked_patches(mesh: Mesh, radius: float, rings: int, rays: int) -> tuple:
-    """The sample points [V, rings, rays, 3], and bool [V, rays]: does the ray meet a vertex."""
+    """The samples, [V, rings, rays, 3], and whether each ray meets a vertex, bool [V, rays]."""
     halves = half_edges(mesh)
     neighbours, first = one_rings(mesh)
     points = np.full((len(mesh.vertices), rings, rays, 3), np.nan)
@@ -371,21 +394,21 @@ WALKED = {
 
 @pytest.mark.parametrize("mesh", WALKED.values(), ids=WALKED)
 @pytest.mark.parametrize("radius, rings, rays", [(0.3, 2, 7), (1.3, 5, 8)])
-def test_a_walk_in_space_comes_to_the_same_points(mesh, radius, rings, rays):
+def test_a_walk_in_space_reaches_the_same_points(mesh, radius, rings, rays):
     points = sample_points(mesh, geodesic_patches(mesh, radius, rings, rays))
     expected, doubtful = walked_patches(mesh, radius, rings, rays)
     assert doubtful.mean() <= 0.01
     points, expected = (np.moveaxis(x, 1, 2)[~doubtful] for x in (points, expected))
     assert np.isfinite(expected).any()
-    np.testing.assert_allclose(points, expected, rtol=0, atol=1e-6)  # NaN where the other is NaN
+    np.testing.assert_allclose(points, expected, rtol=0, atol=1e-6)  # NaN must agree
 
 
-# ------------------------------------------------------------------------ whole samples and empty
+# --------------------------------------------------------------------------- missing samples
 
 
 @every_closed_mesh
 @pytest.mark.parametrize("radius", [0.02, 0.2, 1.0])
-def test_on_a_closed_mesh_every_sample_is_whole(mesh, radius):
+def test_on_a_closed_mesh_no_sample_is_missing(mesh, radius):
     table = geodesic_patches(mesh, radius * size(mesh))
     assert table.whole.all()
     assert_sound(mesh, table)
@@ -393,14 +416,14 @@ def test_on_a_closed_mesh_every_sample_is_whole(mesh, radius):
 
 @every_open_mesh
 @pytest.mark.parametrize("radius", [0.02, 0.2, 1.0])
-def test_on_an_open_mesh_every_sample_is_whole_or_empty(mesh, radius):
+def test_on_an_open_mesh_some_samples_are_missing(mesh, radius):
     table = geodesic_patches(mesh, radius * size(mesh))
     assert 0 < table.whole.mean() < 1
     assert_sound(mesh, table)
 
 
 @every_mesh
-def test_samples_in_line_are_no_farther_apart_than_their_distances(mesh):
+def test_consecutive_samples_are_no_farther_apart_than_the_rings(mesh):
     radius = 0.4 * size(mesh)
     points = sample_points(mesh, geodesic_patches(mesh, radius))
     start = np.broadcast_to(mesh.vertices[:, None, None], points[:, :1].shape)
@@ -409,7 +432,7 @@ def test_samples_in_line_are_no_farther_apart_than_their_distances(mesh):
     assert 0.9 < longest < 1 + 1e-5
 
 
-def test_every_vertex_of_a_triangle_has_the_rays_of_its_corner():
+def test_every_vertex_of_a_triangle_has_the_rays_inside_its_corner():
     mesh = single_triangle()
     whole = geodesic_patches(mesh, 0.01).whole
     for v in range(3):
@@ -420,7 +443,7 @@ def test_every_vertex_of_a_triangle_has_the_rays_of_its_corner():
 
 
 def rays_by_fan(mesh: Mesh, v: int, fans: list) -> tuple[list[int], list[float]]:
-    """How many first samples around v lie in each fan (a set of vertices), and their angles."""
+    """The number of rays of v that start in each fan (a set of vertices), and the fans' angles."""
     table = geodesic_patches(mesh, 1e-3)
     used = [set(row) - {v} for row in table.indices[v, 0][table.whole[v, 0]].tolist()]
     assert all(sum(row <= fan for fan in fans) == 1 for row in used)
@@ -432,14 +455,14 @@ def rays_by_fan(mesh: Mesh, v: int, fans: list) -> tuple[list[int], list[float]]
     return [sum(row <= fan for row in used) for fan in fans], angles
 
 
-def test_where_open_fans_meet_their_angles_follow_one_another():
+def test_the_angles_of_open_fans_that_meet_follow_one_another():
     counts, angles = rays_by_fan(bow_tie(), 0, [{1, 2}, {3, 4}])
     assert sum(counts) == np.sum(sum(angles) > ANGLES + TURN / 32)
     assert all(abs(n - a * 16 / TURN) < 1 for n, a in zip(counts, angles, strict=True))
 
 
 @pytest.mark.parametrize("height", [0.3, 3.0])
-def test_where_closed_fans_meet_they_share_the_whole_turn(height):
+def test_closed_fans_that_meet_share_the_full_turn(height):
     cones = two_cones()
     mesh = Mesh(cones.vertices * [1, 1, height], cones.faces)
     counts, angles = rays_by_fan(mesh, 0, [set(range(1, 6)), set(range(6, 11))])
@@ -452,17 +475,17 @@ def test_where_closed_fans_meet_they_share_the_whole_turn(height):
 
 def degenerate_meshes() -> dict[str, Mesh]:
     sphere, rng = bumpy_sphere(subdivisions=1), np.random.default_rng(0)
-    collapsed = sphere.vertices.copy()  # a vertex and its one-ring in one point
+    collapsed = sphere.vertices.copy()  # a vertex and its one-ring at one point
     collapsed[sphere.faces[(sphere.faces == 40).any(1)]] = sphere.vertices[40]
     return {
         "coincident neighbours": split_vertex(sphere, 40),
-        "points in a line": filled_edge(sphere, 40),
+        "collinear points": filled_edge(sphere, 40),
         "collapsed faces": Mesh(collapsed, sphere.faces),
         "all in one point": Mesh(0 * sphere.vertices + 0.3, sphere.faces),
         "all in one line": Mesh(sphere.vertices * [1, 0, 0], sphere.faces),
         "few points": Mesh(rng.integers(0, 3, sphere.vertices.shape), sphere.faces),
         "triangle": single_triangle(),
-        "lone vertex": Mesh([[0, 0, 0], [1, 0, 0], [0, 1, 0], [5, 5, 5]], [[0, 1, 2]]),
+        "isolated vertex": Mesh([[0, 0, 0], [1, 0, 0], [0, 1, 0], [5, 5, 5]], [[0, 1, 2]]),
         "no faces": Mesh([[0, 0, 0], [1, 0, 0]], []),
     }
 
@@ -473,15 +496,15 @@ every_degenerate_mesh = pytest.mark.parametrize("mesh", DEGENERATE.values(), ids
 
 @every_degenerate_mesh
 @pytest.mark.parametrize("radius", [1e-3, 0.3, 100.0])
-def test_a_degenerate_mesh_gives_whole_samples_or_empty_ones(mesh, radius):
+def test_the_samples_of_a_degenerate_mesh_are_sound(mesh, radius):
     table = geodesic_patches(mesh, radius * max(size(mesh), 1.0))
     assert_sound(mesh, table)
-    lone = np.setdiff1d(np.arange(len(mesh.vertices)), mesh.faces)
-    assert not table.whole[lone].any()
+    isolated = np.setdiff1d(np.arange(len(mesh.vertices)), mesh.faces)
+    assert not table.whole[isolated].any()
 
 
 @pytest.mark.parametrize("name", [name for name in CLOSED | OPEN if name != "body"])
-def test_a_radius_of_a_hundred_times_the_mesh_is_no_harm(name):
+def test_a_radius_of_a_hundred_mesh_sizes_is_accepted(name):
     mesh = (CLOSED | OPEN)[name]
     table = geodesic_patches(mesh, 100 * size(mesh), rings=200, rays=5)
     assert_sound(mesh, table)
@@ -492,20 +515,20 @@ def test_a_radius_of_a_hundred_times_the_mesh_is_no_harm(name):
 
 REFINED = {
     "coincident neighbours": (split_vertex(bumpy_sphere(1), 40), {40}),
-    "points in a line": (filled_edge(bumpy_sphere(1), 40), set(bumpy_sphere(1).faces[40])),
+    "collinear points": (filled_edge(bumpy_sphere(1), 40), set(bumpy_sphere(1).faces[40])),
 }
 
 
 @pytest.mark.parametrize("refined, changed", REFINED.values(), ids=REFINED)
-def test_rays_pass_through_faces_without_area_as_if_they_were_not_there(refined, changed):
-    plain = bumpy_sphere(1)
+def test_zero_area_faces_do_not_change_the_rays_through_them(refined, changed):
+    original = bumpy_sphere(1)
     table = geodesic_patches(refined, 1.5)
-    same = sorted(set(range(len(plain.vertices))) - changed)
-    crossed = (table.indices[same] == len(plain.vertices)).any(-1)
+    same = sorted(set(range(len(original.vertices))) - changed)
+    crossed = (table.indices[same] == len(original.vertices)).any(-1)
     assert crossed.sum() > 20
     points, expected = (
         sample_points(refined, table),
-        sample_points(plain, geodesic_patches(plain, 1.5)),
+        sample_points(original, geodesic_patches(original, 1.5)),
     )
     np.testing.assert_allclose(points[same], expected[same], rtol=0, atol=1e-6)
 
@@ -513,28 +536,28 @@ def test_rays_pass_through_faces_without_area_as_if_they_were_not_there(refined,
 @pytest.mark.parametrize(
     "splits", [[(0, 3)], [(0, 1)], [(1, 5)], [(0, 3), (0, 2)], [(0, 1), (0, 1)]], ids=str
 )
-def test_neighbours_in_one_point_all_have_samples_at_the_right_distances(splits):
+def test_coincident_neighbours_all_have_samples_at_the_right_distances(splits):
     mesh, v = icosphere(3), 300
-    for begin, end in splits:  # the last of them has a face whose corners are all in one point
+    for begin, end in splits:  # the last one has a face whose corners all coincide
         mesh = split_vertex(mesh, v, begin, end)
     table = geodesic_patches(mesh, 0.5)
     assert table.whole.all()
-    there = (mesh.vertices == mesh.vertices[v]).all(1)
-    assert there.sum() == 1 + len(splits)
-    points = sample_points(mesh, table)[there]
+    coincident = (mesh.vertices == mesh.vertices[v]).all(1)
+    assert coincident.sum() == 1 + len(splits)
+    points = sample_points(mesh, table)[coincident]
     distance = np.arccos(points @ mesh.vertices[v] / np.linalg.norm(points, axis=-1))
     error = np.abs(distance / (0.5 * DISTANCES) - 1)
     assert error.mean() < 0.003 and error.max() < 0.005
 
 
 @pytest.mark.parametrize("begin, end", [(0, 3), (1, 4), (2, 5)])
-def test_two_neighbours_in_one_point_share_the_rays_of_one_vertex(begin, end):
-    """Each has half of the faces; its rays go on into the other half."""
+def test_two_coincident_neighbours_share_the_rays_of_one_vertex(begin, end):
+    """Each has half of the faces; its rays continue into the other half."""
     mesh = split_vertex(lattice(9, 9), 40, begin, end)
     flat_grid_angles(mesh, geodesic_patches(mesh, 2.3), 2.3, [40, 81])
 
 
-# -------------------------------------------------------------------------- what must not matter
+# -------------------------------------------------------------------------------- invariances
 
 NUMBERED = {
     "sphere": bumpy_sphere(1),
@@ -547,8 +570,11 @@ every_numbered_mesh = pytest.mark.parametrize("mesh", NUMBERED.values(), ids=NUM
 
 
 def assert_same_but_for_first_directions(mesh: Mesh, other: np.ndarray, radius: float) -> None:
-    """`other`: sample points. At a boundary vertex they are the same; where the directions of an
-    inner vertex begin is arbitrary, but where the first sample is the same, all of them are."""
+    """Check sample points `other` of the same surface.
+
+    At boundary vertices they are equal. The first direction of an inner vertex is arbitrary; where
+    the first sample is equal, all of them are.
+    """
     points = sample_points(mesh, geodesic_patches(mesh, radius))
     halves = half_edges(mesh)
     inner = np.ones(len(mesh.vertices), bool)
@@ -559,14 +585,14 @@ def assert_same_but_for_first_directions(mesh: Mesh, other: np.ndarray, radius: 
 
 
 @every_numbered_mesh
-def test_the_numbering_of_vertices_and_faces_matters_for_first_directions_alone(mesh):
+def test_the_numbering_of_vertices_and_faces_changes_first_directions_alone(mesh):
     other, order = shuffled(mesh, 4)
     points = sample_points(other, geodesic_patches(other, 0.7))[np.argsort(order)]
     assert_same_but_for_first_directions(mesh, points, 0.7)
 
 
 @every_numbered_mesh
-def test_where_faces_begin_matters_for_first_directions_alone(mesh):
+def test_the_first_corners_of_faces_change_first_directions_alone(mesh):
     other = rolled(mesh, 4)
     assert_same_but_for_first_directions(
         mesh, sample_points(other, geodesic_patches(other, 0.7)), 0.7
@@ -584,7 +610,7 @@ def test_renumbering_vertices_alone_renumbers_the_table(mesh):
 
 @every_numbered_mesh
 @pytest.mark.parametrize("scale", [1000.0, 1e-5])
-def test_the_unit_of_length_does_not_matter(mesh, scale):
+def test_patches_are_invariant_to_the_unit_of_length(mesh, scale):
     one = geodesic_patches(mesh, 0.7)
     other = geodesic_patches(Mesh(mesh.vertices * scale, mesh.faces), 0.7 * scale)
     np.testing.assert_array_equal(one.indices, other.indices)
@@ -616,7 +642,7 @@ def test_shapes_and_types_follow_the_arguments():
 
 
 @every_mesh
-def test_more_rings_or_rays_go_through_the_same_samples(mesh):
+def test_finer_grids_contain_the_samples_of_coarser_ones(mesh):
     radius = 0.3 * size(mesh)
     points = sample_points(mesh, geodesic_patches(mesh, radius))
     finer = sample_points(mesh, geodesic_patches(mesh, radius, rings=10))
@@ -626,7 +652,7 @@ def test_more_rings_or_rays_go_through_the_same_samples(mesh):
 
 
 @pytest.mark.parametrize("radius", [0, -1, np.nan, np.inf])
-def test_a_radius_that_is_none_is_refused(radius):
+def test_a_wrong_radius_is_refused(radius):
     with pytest.raises(ValueError, match=f"radius must be positive and finite, got {radius}"):
         geodesic_patches(lattice(3, 3), radius)
 
@@ -638,30 +664,25 @@ def test_a_grid_without_samples_is_refused(rings, rays):
 
 
 @pytest.mark.parametrize("mesh", [bumpy_sphere(), lattice(7, 8)], ids=["sphere", "lattice"])
-def test_turned_by_whole_rays_the_samples_move_on_by_as_many(mesh):
+def test_a_turn_by_whole_rays_shifts_the_rays(mesh):
     shifts = np.arange(len(mesh.vertices)) % 16
-    little = 1e-3  # so that no ray meets an edge of the lattice's boundary
-    plain, turned = (
-        geodesic_patches(mesh, 0.5, turn=s * 2 * np.pi / 16 + little) for s in (0 * shifts, shifts)
+    offset = 1e-3  # so that no ray meets an edge of the lattice's boundary
+    unturned, turned = (
+        geodesic_patches(mesh, 0.5, turn=s * 2 * np.pi / 16 + offset) for s in (0 * shifts, shifts)
     )
     for v, shift in enumerate(shifts):
-        np.testing.assert_array_equal(turned.indices[v], np.roll(plain.indices[v], -shift, axis=1))
-        np.testing.assert_allclose(
-            turned.weights[v], np.roll(plain.weights[v], -shift, axis=1), atol=1e-5
-        )
+        indices, weights = (np.roll(part[v], -shift, axis=1) for part in unturned)
+        np.testing.assert_array_equal(turned.indices[v], indices)
+        np.testing.assert_allclose(turned.weights[v], weights, atol=1e-5)
 
 
-def test_on_a_plane_a_turn_is_an_angle():
-    mesh = lattice(9, 9)
-    plain, turned = (geodesic_patches(mesh, 2.0, turn=np.full(81, t)) for t in (0.0, 0.3))
-    a, b = (
-        np.einsum("rsk,rskx->rsx", t.weights[40], mesh.vertices[t.indices[40]])
-        for t in (plain, turned)
-    )
+def test_on_a_plane_a_turn_rotates_the_samples():
+    mesh, v = lattice(9, 9), 40
+    steps = [
+        sample_points(mesh, geodesic_patches(mesh, 2.0, turn=np.full(81, turn)))[v]
+        - mesh.vertices[v]
+        for turn in (0.0, 0.3)
+    ]
     cosine, sine = np.cos(0.3), np.sin(0.3)
-    a, b = a - mesh.vertices[40], b - mesh.vertices[40]
-    rotated = np.stack(
-        [cosine * a[..., 0] - sine * a[..., 1], sine * a[..., 0] + cosine * a[..., 1], a[..., 2]],
-        axis=-1,
-    )
-    np.testing.assert_allclose(b, rotated, atol=1e-5)
+    rotation = np.array([[cosine, -sine, 0], [sine, cosine, 0], [0, 0, 1]])
+    np.testing.assert_allclose(steps[1], steps[0] @ rotation.T, atol=1e-5)

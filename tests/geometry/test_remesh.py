@@ -1,20 +1,22 @@
-"""Other tessellations of one surface, and the points that their vertices came from."""
+"""Remeshing: the surface stays, its tessellation changes, and closest points are correct."""
 
 from __future__ import annotations
 
 import builtins
+import typing
 
 import numpy as np
 import pytest
 import trimesh
 from scipy.spatial import cKDTree
 
-from meshspiral.experiment.schema import ONE_OF
+from meshspiral.data.settings import RemeshSettings
+from meshspiral.geometry.barycentric import interpolate
 from meshspiral.geometry.mesh import Mesh, MeshError
 from meshspiral.geometry.remesh import POLICIES, Tool, bending, closest_points, remesh
 from tests.meshes import bumpy_sphere, lattice
 
-KINDS = [policy for policy in POLICIES if policy != "mixed"]
+SINGLE = [policy for policy in POLICIES if policy != "mixed"]
 
 
 @pytest.fixture(scope="module")
@@ -26,8 +28,8 @@ def solid(mesh):
     return trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
 
 
-@pytest.mark.parametrize("policy", KINDS)
-def test_another_tessellation_of_the_same_surface(surface, policy):
+@pytest.mark.parametrize("policy", SINGLE)
+def test_every_policy_remeshes_the_same_surface(surface, policy):
     made = remesh(surface, 400, policy, seed=2)
     mesh, shape = made.mesh, solid(made.mesh)
     assert 0.95 * 400 <= len(mesh.vertices) <= 400
@@ -38,8 +40,8 @@ def test_another_tessellation_of_the_same_surface(surface, policy):
     edge = shape.edges_unique_length.mean()
     assert made.distance.max() < (0.9 if policy == "marching" else 0.3) * edge
     _, _, back = closest_points(mesh, surface.vertices, surface.vertex_normals)
-    assert back.max() < edge  # nothing is lost
-    point = np.einsum("vk,vkx->vx", made.weights, surface.vertices[surface.faces[made.faces]])
+    assert back.max() < edge  # no part is lost
+    point = interpolate(surface.vertices, surface.faces[made.faces], made.weights)
     np.testing.assert_allclose(
         np.linalg.norm(point - mesh.vertices, axis=1), made.distance, atol=1e-6
     )
@@ -47,22 +49,22 @@ def test_another_tessellation_of_the_same_surface(surface, policy):
     assert (made.weights >= 0).all()
 
 
-def test_one_seed_one_mesh_and_another_another(surface):
+def test_the_seed_determines_the_mesh(surface):
     one, same, other = (remesh(surface, 300, seed=seed).mesh for seed in (1, 1, 2))
     np.testing.assert_array_equal(one.vertices, same.vertices)
     np.testing.assert_array_equal(one.faces, same.faces)
     assert one.faces.shape != other.faces.shape or (one.faces != other.faces).any()
 
 
-def test_policies_differ_as_they_say(surface):
-    """Spread of edge lengths, and the shape of triangles."""
-    made = {policy: solid(remesh(surface, 600, policy, seed=0).mesh) for policy in KINDS}
+def test_policies_differ_as_documented(surface):
+    """In the spread of edge lengths and the shape of triangles."""
+    made = {policy: solid(remesh(surface, 600, policy, seed=0).mesh) for policy in SINGLE}
     spread = {
         k: m.edges_unique_length.std() / m.edges_unique_length.mean() for k, m in made.items()
     }
     angle = {k: np.median(m.face_angles.min(axis=1)) for k, m in made.items()}
     slivers = {k: np.percentile(m.face_angles.min(axis=1), 5) for k, m in made.items()}
-    assert all(spread["isotropic"] < spread[k] for k in KINDS if k != "isotropic")
+    assert all(spread["isotropic"] < spread[k] for k in SINGLE if k != "isotropic")
     assert spread["refined"] > 1.5 * spread["isotropic"]
     assert angle["simplified"] < angle["isotropic"]
     assert slivers["marching"] < 0.5 * slivers["isotropic"]
@@ -70,7 +72,7 @@ def test_policies_differ_as_they_say(surface):
 
 @pytest.mark.parametrize("vertices", [200, 600])
 def test_adaptive_edges_are_short_where_the_surface_is_curved(surface, vertices):
-    """Mean edge at the most curved quarter of the vertices, over that at the least curved."""
+    """Compares mean edges at the most and the least curved quarter of the vertices."""
 
     def ratio(policy):
         mesh = remesh(surface, vertices, policy, seed=0).mesh
@@ -93,8 +95,8 @@ def test_bending_of_a_sphere_is_that_of_a_cap():
     assert bending(lattice(9, 9), 1.0).max() < 1e-12
 
 
-@pytest.mark.parametrize("policy", KINDS)
-def test_tori_and_open_surfaces_get_their_size(policy):
+@pytest.mark.parametrize("policy", SINGLE)
+def test_tori_and_open_surfaces_get_the_size_wanted(policy):
     torus = trimesh.creation.torus(1, 0.4, major_sections=32, minor_sections=16)
     made = remesh(Mesh(torus.vertices, torus.faces), 300, policy, seed=1).mesh
     assert 285 <= len(made.vertices) <= 300 and solid(made).euler_number == 0
@@ -105,31 +107,31 @@ def test_tori_and_open_surfaces_get_their_size(policy):
     assert 90 <= len(made.vertices) <= 100 and not solid(made).is_watertight
 
 
-def test_mixed_draws_one_of_the_others(surface, monkeypatch):
+def test_mixed_draws_every_other_policy(surface, monkeypatch):
     drawn = []
-    for kind in KINDS:
+    for kind in SINGLE:
         monkeypatch.setitem(POLICIES, kind, lambda tool, rng, kind=kind: drawn.append(kind))
     for seed in range(30):
         remesh(surface, len(surface.vertices) - 2, "mixed", seed)
-    assert set(drawn) == set(KINDS)
+    assert set(drawn) == set(SINGLE)
 
 
-def test_where_two_sheets_touch_a_vertex_stays_on_its_own():
-    """A flat box, 0.01 thick: the other side is nearer than many a point of the own side."""
+def test_where_two_sheets_touch_the_closest_point_is_on_the_own_sheet():
+    """In a flat box, 0.01 thick, the other side is nearer than many points of the own side."""
     box = trimesh.creation.box((1, 1, 0.01)).subdivide().subdivide().subdivide()
     box = Mesh(box.vertices, box.faces)
     flat = np.abs(box.vertices[:, 2]) > 0.004
     points = box.vertices.copy()
-    points[:, 2] *= -0.2  # pushed through, nearer to the other side
+    points[:, 2] *= -0.2  # pushed through the box, nearer to the other side
     normals = np.zeros_like(points)
     normals[:, 2] = np.sign(box.vertices[:, 2])
     inner = (np.abs(box.vertices[:, :2]) < 0.4).all(axis=1) & flat
     face, weights, _ = closest_points(box, points[inner], normals[inner])
-    reached = np.einsum("qk,qkx->qx", weights, box.vertices[box.faces[face]])
+    reached = interpolate(box.vertices, box.faces[face], weights)
     np.testing.assert_allclose(reached, box.vertices[inner], atol=1e-9)
 
 
-def test_closest_points_are_those_of_all_faces(surface):
+def test_closest_points_agree_with_exhaustive_search(surface):
     rng = np.random.default_rng(0)
     points = (
         surface.vertices[rng.integers(len(surface.vertices), size=60)]
@@ -150,7 +152,7 @@ def test_closest_points_are_those_of_all_faces(surface):
         np.testing.assert_allclose(weight @ triangles[found], every[found], atol=1e-9)
 
 
-def test_without_a_face_that_agrees_the_nearest_counts():
+def test_without_an_agreeing_face_the_nearest_counts():
     plane = lattice(4, 4)
     up = plane.face_normals[0] / np.linalg.norm(plane.face_normals[0])
     face, weights, distance = closest_points(plane, plane.vertices[5:6] + up, -up[None])
@@ -162,15 +164,15 @@ def test_without_a_face_that_agrees_the_nearest_counts():
     "arguments, message",
     [
         ((300, "knitted"), "policy must be one of isotropic, adaptive, .*; got 'knitted'"),
-        ((5, "isotropic"), "a mesh of 5 vertices is no surface"),
+        ((5, "isotropic"), "vertices must be at least 12, got 5"),
     ],
 )
-def test_what_cannot_be_is_refused(surface, arguments, message):
+def test_wrong_arguments_are_refused(surface, arguments, message):
     with pytest.raises(MeshError, match=message):
         remesh(surface, *arguments)
 
 
-def test_without_pymeshlab_one_line_names_the_extra(surface, monkeypatch):
+def test_without_pymeshlab_the_error_names_the_extra(surface, monkeypatch):
     real = builtins.__import__
 
     def without(name, *arguments, **options):
@@ -183,5 +185,5 @@ def test_without_pymeshlab_one_line_names_the_extra(surface, monkeypatch):
         Tool(surface, 100, np.random.default_rng(0))
 
 
-def test_the_config_knows_every_policy():
-    assert ONE_OF["data.remesh.policy"] == tuple(POLICIES)
+def test_the_config_accepts_every_policy():
+    assert typing.get_args(RemeshSettings.model_fields["policy"].annotation) == tuple(POLICIES)

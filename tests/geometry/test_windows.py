@@ -1,4 +1,6 @@
-"""Polar coordinates are exact where they can be; the windows are the published formulae on them."""
+"""Polar coordinates are exact on flat surfaces, and windows follow the published formulae."""
+
+from __future__ import annotations
 
 import itertools
 from time import process_time
@@ -6,12 +8,15 @@ from time import process_time
 import numpy as np
 import pytest
 import trimesh
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import dijkstra
 from scipy.spatial import Delaunay
 
 from meshspiral.geometry.connectivity import one_rings
+from meshspiral.geometry.faces import directed_edges
 from meshspiral.geometry.mesh import Mesh
-from meshspiral.geometry.patches import _directions, _left, geodesic_patches
-from meshspiral.geometry.windows import _polar, gaussian_windows
+from meshspiral.geometry.patches import face_sectors, geodesic_patches, left_corners
+from meshspiral.geometry.windows import gaussian_windows, polar_coordinates
 from tests.meshes import bow_tie, bumpy_sphere, lattice, punctured, random_meshes, torus
 
 MESHES = random_meshes()
@@ -19,7 +24,7 @@ every_mesh = pytest.mark.parametrize("mesh", MESHES.values(), ids=MESHES)
 
 
 def plane(seed: int, stretch: float = 1.0, count: int = 250) -> Mesh:
-    """An irregular mesh of a rectangle, 1 x `stretch`, seen from +z; of needles, if stretched."""
+    """An irregular mesh of the rectangle 1 x `stretch`, facing +z; if stretched, of needles."""
     rng = np.random.default_rng(seed)
     points = np.concatenate([rng.random((count, 2)), [[0, 0], [1, 0], [0, 1], [1, 1]]])
     faces = Delaunay(points).simplices
@@ -30,8 +35,11 @@ def plane(seed: int, stretch: float = 1.0, count: int = 250) -> Mesh:
 
 
 def pyramid(heights: list[float], parts: int = 5) -> Mesh:
-    """Flat triangles around vertex 0, their base points on a circle at `heights`; each is cut into
-    parts^2, the cuts unevenly spaced. Fewer than 2 pi around vertex 0, or more."""
+    """A cone or saddle: flat triangles around vertex 0, with base points on a circle at `heights`.
+
+    Each triangle is cut into parts^2 faces, with uneven cuts. The angles at vertex 0 sum to less
+    than 2 pi, or more.
+    """
     n = len(heights)
     turn = 2 * np.pi * np.arange(n) / n + 0.2 * np.sin(np.arange(n))
     base = np.stack([np.cos(turn), np.sin(turn), heights], 1)
@@ -58,15 +66,16 @@ def pyramid(heights: list[float], parts: int = 5) -> Mesh:
 
 
 def polar(mesh: Mesh, v: int, radius: float):
-    """(distance, angle) [V] around v, infinite beyond the radius."""
+    """Distance and angle of all vertices around v, [V] each; inf beyond the radius."""
     neighbours, first = one_rings(mesh)
-    for_numba = mesh.vertices, neighbours, first, _left(mesh.faces, neighbours, first)
+    surface = mesh.vertices, neighbours, first, left_corners(mesh.faces, neighbours, first)
     count = len(mesh.vertices)
     distance, angle, disk = np.full(count, np.inf), np.zeros(count), np.zeros(count, np.int32)
-    turns = np.zeros(count, np.int32)
-    size = _polar(int(v), *for_numba, _directions(*for_numba), radius, distance, angle, turns, disk)
+    updates = np.zeros(count, np.int32)
+    sectors = face_sectors(*surface)
+    size = polar_coordinates(int(v), *surface, sectors, radius, distance, angle, updates, disk)
     assert sorted(disk[:size]) == np.flatnonzero(np.isfinite(distance)).tolist()
-    assert not turns.any()
+    assert not updates.any()
     return distance, angle
 
 
@@ -77,32 +86,32 @@ def zero_direction(mesh: Mesh, v: int) -> int:
 
 
 def planar(mesh: Mesh, v: int):
-    """(distance, angle) [V] around v by trigonometry, for a mesh in the plane."""
+    """Distance and angle of all vertices around v, [V] each, on a mesh in the plane z = 0."""
     x, y, _ = (mesh.vertices - mesh.vertices[v]).T
     angle = np.arctan2(y, x)
     return np.hypot(x, y), angle - angle[zero_direction(mesh, v)]
 
 
 def apart(a, b):
-    """The largest angle between directions a and b."""
+    """The largest angle between the directions a and b."""
     return np.abs((a - b + np.pi) % (2 * np.pi) - np.pi).max()
 
 
 def dense(table, count: int) -> np.ndarray:
-    """The rows, [V * rings * rays, V]."""
+    """The rows of a table as a matrix, [V * rings * rays, V]."""
     out = np.zeros((len(table.first) - 1, count))
     rows = np.repeat(np.arange(len(out)), np.diff(table.first))
     np.add.at(out, (rows, table.indices), table.weights)
     return out
 
 
-def check_whole(table, mesh: Mesh, rings: int = 5, rays: int = 16) -> None:
-    """Every row of a vertex with a face sums to 1, of weights that are none negative."""
+def assert_normalised(table, mesh: Mesh, rings: int = 5, rays: int = 16) -> None:
+    """Every row of a vertex on a face has positive weights with sum 1; other rows are empty."""
     assert table.indices.dtype == np.int32 and table.weights.dtype == np.float32
     assert table.first.dtype == np.int64 and table.first[0] == 0
     assert table.first.shape == (len(mesh.vertices) * rings * rays + 1,)
     assert table.first[-1] == len(table.indices) == len(table.weights)
-    assert (table.weights > 0).all()  # and no NaN
+    assert (table.weights > 0).all()  # false for NaN
     used = np.isin(np.arange(len(mesh.vertices)), mesh.faces).repeat(rings * rays)
     np.testing.assert_array_equal(np.diff(table.first) > 0, used)
     sums = dense(table, len(mesh.vertices)).sum(1)
@@ -118,7 +127,7 @@ def check_whole(table, mesh: Mesh, rings: int = 5, rays: int = 16) -> None:
     ids=["small", "medium", "all", "needles"],
 )
 def test_on_a_plane_distances_and_angles_are_exact(stretch, radius):
-    """From inner vertices and from the boundary: in a rectangle every straight line is inside."""
+    """Also from boundary vertices: in a rectangle every straight line stays inside."""
     mesh = plane(1, stretch)
     for v in range(0, len(mesh.vertices), 3):
         distance, angle = polar(mesh, v, radius)
@@ -127,11 +136,11 @@ def test_on_a_plane_distances_and_angles_are_exact(stretch, radius):
         np.testing.assert_array_equal(np.isfinite(distance), near)
         np.testing.assert_allclose(distance[near], expected[near], rtol=1e-8)
         near[v] = False
-        assert apart(angle[near], expected_angle[near]) < 1e-4  # as the root of the above
+        assert apart(angle[near], expected_angle[near]) < 1e-4  # the square root of the bound above
 
 
 @pytest.mark.parametrize("heights", [[-0.8] * 5, [0.7, -0.7] * 3], ids=["cone", "saddle"])
-def test_around_an_apex_angles_are_rescaled_to_a_whole_turn(heights):
+def test_around_an_apex_angles_are_rescaled_to_a_full_turn(heights):
     mesh = pyramid(heights)
     distance, angle = polar(mesh, 0, 9.0)
     np.testing.assert_allclose(distance, np.linalg.norm(mesh.vertices, axis=1), rtol=1e-9)
@@ -145,14 +154,14 @@ def test_around_an_apex_angles_are_rescaled_to_a_whole_turn(heights):
     for u in range(1, len(mesh.vertices)):
         x = mesh.vertices[u] / np.linalg.norm(mesh.vertices[u])
         to = np.arccos(np.clip(corners @ x, -1, 1))
-        side = np.argmin(np.abs(to + np.roll(to, -1) - widths))  # the side that x lies in
+        side = np.argmin(np.abs(to + np.roll(to, -1) - widths))  # the side that contains x
         expected = (begins[side] + to[side] - start) * 2 * np.pi / widths.sum()
         assert apart(angle[u], expected) < 1e-6
 
 
 def test_behind_a_corner_of_half_a_turn_angles_are_exact():
-    """Vertex 0 lies on the edge from 1 to 2, which a face without area joins to it; rounding makes
-    its corner a little more than half a turn, or less, and the edge too short, or too long."""
+    """Vertex 0 lies on the edge from 1 to 2 and is connected to it by a face of zero area. Rounding
+    makes its corner slightly more or less than half a turn, and the edge too short or too long."""
     rng = np.random.default_rng(0)
     faces = np.array([[0, 1, 2], [0, 3, 1], [0, 2, 3], [2, 1, 4], [2, 4, 5]])
     for first in range(100):
@@ -161,7 +170,7 @@ def test_behind_a_corner_of_half_a_turn_angles_are_exact():
         mesh = Mesh(vertices, np.roll(faces, first, axis=0))
         distance, angle = polar(mesh, 0, 9.0)
         expected, expected_angle = planar(mesh, 0)
-        np.testing.assert_allclose(distance, expected, rtol=1e-7)  # the root of rounding
+        np.testing.assert_allclose(distance, expected, rtol=1e-7)  # the square root of rounding
         assert apart(angle[1:], expected_angle[1:]) < 1e-6
 
 
@@ -177,7 +186,7 @@ def test_on_a_sphere_distances_are_great_circles():
     assert np.concatenate(errors).mean() < 0.01
 
 
-def test_where_only_a_vertex_joins_faces_the_way_leads_through_it():
+def test_paths_lead_through_a_bow_tie():
     mesh = bow_tie()
     distance, angle = polar(mesh, 1, 9.0)
     to = np.linalg.norm(mesh.vertices, axis=1)
@@ -187,12 +196,9 @@ def test_where_only_a_vertex_joins_faces_the_way_leads_through_it():
 
 
 @every_mesh
-def test_no_way_is_shorter_than_a_straight_line_or_longer_than_along_edges(mesh):
-    """True on these meshes, which are not folded far."""
-    from scipy.sparse import coo_matrix
-    from scipy.sparse.csgraph import dijkstra
-
-    start, tip = mesh.faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2).T
+def test_distances_are_between_the_straight_line_and_the_path_along_edges(mesh):
+    """This holds on these meshes, which are not strongly folded."""
+    start, tip = directed_edges(mesh.faces).T
     lengths = np.linalg.norm(mesh.vertices[start] - mesh.vertices[tip], axis=1)
     count = len(mesh.vertices)
     graph = coo_matrix((lengths, (start, tip)), (count, count)).tocsr()
@@ -211,7 +217,7 @@ def test_no_way_is_shorter_than_a_straight_line_or_longer_than_along_edges(mesh)
 
 
 def literal_windows(mesh, v, radius, rings, rays) -> np.ndarray:
-    """The rows of v in a planar mesh, [rings * rays, V], word for word as the docstring."""
+    """The rows of v in a planar mesh, [rings * rays, V], by the formulae of `gaussian_windows`."""
     r, t = planar(mesh, v)
     m = (np.arange(rings) + 0.5) * radius / rings
     ring = np.exp(-(((r[:, None] - m) / (2 * radius / rings)) ** 2))
@@ -234,7 +240,7 @@ def literal_windows(mesh, v, radius, rings, rays) -> np.ndarray:
 
 
 @pytest.mark.parametrize("rings, rays", [(5, 16), (3, 7), (1, 1)])
-def test_the_weights_are_the_formulae(rings, rays):
+def test_weights_follow_the_formulae(rings, rays):
     mesh = plane(2)
     table = dense(gaussian_windows(mesh, 0.25, rings, rays), len(mesh.vertices))
     for v in range(0, len(mesh.vertices), 30):
@@ -246,9 +252,9 @@ def test_the_weights_are_the_formulae(rings, rays):
 
 @every_mesh
 @pytest.mark.parametrize("radius", [1e-3, 0.5, 3.0, 100.0])
-def test_every_row_is_whole(mesh, radius):
-    check_whole(gaussian_windows(mesh, radius), mesh)
-    check_whole(gaussian_windows(mesh, radius, 2, 3), mesh, 2, 3)
+def test_every_row_is_normalised(mesh, radius):
+    assert_normalised(gaussian_windows(mesh, radius), mesh)
+    assert_normalised(gaussian_windows(mesh, radius, 2, 3), mesh, 2, 3)
 
 
 def test_a_patch_of_one_vertex_is_that_vertex():
@@ -258,14 +264,15 @@ def test_a_patch_of_one_vertex_is_that_vertex():
     np.testing.assert_array_equal(table.weights, 1)
 
 
-def test_where_all_rings_but_a_far_one_vanish_rows_are_whole():
-    """The last ring's exp(-10^4) is no float, and the row would be 0 / 0."""
+def test_rows_are_normalised_where_all_rings_but_a_far_one_vanish():
+    """The last ring's exp(-10^4) underflows; a row of it alone would be 0 / 0."""
     mesh = bumpy_sphere()
-    check_whole(gaussian_windows(mesh, 1e-3, rings=200, rays=2), mesh, 200, 2)
-    check_whole(gaussian_windows(mesh, 0.5, rings=200, rays=2), mesh, 200, 2)
+    assert_normalised(gaussian_windows(mesh, 1e-3, rings=200, rays=2), mesh, 200, 2)
+    assert_normalised(gaussian_windows(mesh, 0.5, rings=200, rays=2), mesh, 200, 2)
 
 
 def collapsed(mesh: Mesh, how: str) -> Mesh:
+    """The mesh with damaged coordinates."""
     x = mesh.vertices.copy()
     if how == "edges":
         for a, b, _ in mesh.faces[::4]:
@@ -287,14 +294,14 @@ def collapsed(mesh: Mesh, how: str) -> Mesh:
     "how", ["edges", "onto a plane", "onto a line", "to a point", "to coarse steps", "shuffled"]
 )
 @every_mesh
-def test_on_damaged_meshes_every_row_is_whole(mesh, how):
+def test_on_damaged_meshes_every_row_is_normalised(mesh, how):
     damaged = collapsed(mesh, how)
     for radius in (0.3, 2.0):
-        check_whole(gaussian_windows(damaged, radius, 2, 5), damaged, 2, 5)
+        assert_normalised(gaussian_windows(damaged, radius, 2, 5), damaged, 2, 5)
 
 
-def test_where_needles_correct_one_another_without_end_the_front_ends():
-    """Half a second; forty times that, if every correction were followed up."""
+def test_the_front_ends_where_needles_correct_one_another():
+    """Takes 0.5 s; forty times that if every correction were processed."""
     mesh = punctured(bumpy_sphere(3, 3), 0.4)
     mesh = Mesh(mesh.vertices * [1e5, 1, 1], mesh.faces)
     polar(mesh, 0, 1.0)  # compile
@@ -304,22 +311,22 @@ def test_where_needles_correct_one_another_without_end_the_front_ends():
     assert process_time() - start < 5
 
 
-def test_a_patch_without_area_takes_all_vertices_alike():
+def test_in_a_patch_without_area_all_vertices_count_alike():
     mesh = collapsed(bumpy_sphere(subdivisions=1), "to a point")
     rows = dense(gaussian_windows(mesh, 1.0), 42)
-    # all of the component are at distance 0
+    # all vertices of the component are at distance 0
     np.testing.assert_allclose(rows, 1 / 42, rtol=1e-5)
 
 
-def test_a_vertex_without_area_has_no_weight_beside_others():
+def test_a_vertex_without_area_has_no_weight_next_to_others():
     mesh = Mesh([[0, 0, 0], [1, 0, 0], [0, 1, 0], [2, 0, 0], [3, 0, 0]], [[0, 1, 2], [1, 3, 4]])
     rows = dense(gaussian_windows(mesh, 2.5), 5).reshape(5, 80, 5)
     assert (rows[1, :, 3:] == 0).all() and (rows[1].sum(1) > 0.99).all()
     assert (rows[4, :, 3:] == 0).all() and (rows[4].sum(1) > 0.99).all()
 
 
-def test_windows_stand_in_the_directions_of_the_rays():
-    """The mean of a cell lies where the ray's sample lies, and not a step aside or mirrored."""
+def test_windows_have_the_directions_of_the_rays():
+    """The mean of a cell is nearest to the sample of its own ray, neither shifted nor mirrored."""
     mesh = bumpy_sphere(3, subdivisions=4)
     rays = 16
     patches = geodesic_patches(mesh, 0.3, 5, rays)
@@ -343,7 +350,7 @@ def test_windows_stand_in_the_directions_of_the_rays():
 
 @every_mesh
 def test_renumbering_the_vertices_renumbers_the_table(mesh):
-    """The order of the faces stays, and with it the first direction of every vertex."""
+    """The order of the faces is unchanged, and with it the first direction of every vertex."""
     order = np.random.default_rng(5).permutation(len(mesh.vertices))
     rows = dense(gaussian_windows(mesh, 0.9, 3, 8), len(order)).reshape(-1, 24, len(order))
     other = dense(gaussian_windows(mesh.renumbered(order), 0.9, 3, 8), len(order))
@@ -354,7 +361,7 @@ def test_renumbering_the_vertices_renumbers_the_table(mesh):
 @pytest.mark.parametrize(
     "mesh", [bumpy_sphere(1), punctured(bumpy_sphere(4, 3), 0.1)], ids=["closed", "open"]
 )
-def test_renumbering_the_faces_only_turns_the_patches_of_inner_vertices(mesh):
+def test_renumbering_the_faces_only_turns_patches(mesh):
     rng = np.random.default_rng(6)
     faces = mesh.faces[rng.permutation(len(mesh.faces))]
     other = Mesh(mesh.vertices, np.roll(faces, 1, axis=1))
@@ -370,7 +377,7 @@ def test_renumbering_the_faces_only_turns_the_patches_of_inner_vertices(mesh):
     assert turned > 10
 
 
-def test_neither_the_unit_nor_a_rigid_motion_matters():
+def test_windows_are_invariant_to_unit_and_rigid_motion():
     mesh = punctured(bumpy_sphere(2), 0.1)
     count = len(mesh.vertices)
     rotation = np.linalg.qr(np.random.default_rng(1).normal(size=(3, 3)))[0]
@@ -382,7 +389,7 @@ def test_neither_the_unit_nor_a_rigid_motion_matters():
         np.testing.assert_allclose(other_rows, rows, atol=1e-5)
 
 
-def test_on_a_lattice_opposite_cells_lie_opposite_and_outer_rings_farther_out():
+def test_on_a_lattice_opposite_cells_are_opposite_and_outer_rings_farther_out():
     mesh = lattice(13, 13)
     v = 6 * 13 + 6
     rows = dense(gaussian_windows(mesh, 4.2, 4, 12), 169)[v * 48 : (v + 1) * 48]
@@ -403,7 +410,7 @@ def test_on_a_lattice_opposite_cells_lie_opposite_and_outer_rings_farther_out():
         ((1.0, 3, 0), "rings and rays must be at least 1, got 3 and 0"),
     ],
 )
-def test_wrong_arguments_are_named(arguments, message):
+def test_wrong_arguments_are_refused(arguments, message):
     with pytest.raises(ValueError, match=message):
         gaussian_windows(torus(), *arguments)
 
@@ -414,10 +421,10 @@ def test_a_mesh_without_faces_has_empty_rows():
     assert table.first.tolist() == [0] * 161
 
 
-def test_turned_by_whole_rays_the_windows_move_on_by_as_many():
+def test_a_turn_by_whole_rays_shifts_the_rays():
     mesh = bumpy_sphere()
     shifts = np.arange(len(mesh.vertices)) % 16
-    plain = gaussian_windows(mesh, 0.6)
+    unturned = gaussian_windows(mesh, 0.6)
     turned = gaussian_windows(mesh, 0.6, turn=shifts * 2 * np.pi / 16)
 
     def row(table, v, ring, ray):
@@ -428,5 +435,5 @@ def test_turned_by_whole_rays_the_windows_move_on_by_as_many():
         return out
 
     for v, ring, ray in itertools.product(range(0, 162, 9), range(5), range(0, 16, 3)):
-        expected = row(plain, v, ring, ray + shifts[v])
+        expected = row(unturned, v, ring, ray + shifts[v])
         np.testing.assert_allclose(row(turned, v, ring, ray), expected, atol=0.011)

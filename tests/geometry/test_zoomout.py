@@ -25,11 +25,11 @@ def test_eigenfunctions_are_orthonormal_and_those_of_the_sphere():
     np.testing.assert_allclose(fitted, x, atol=0.01)
 
 
-def test_noise_goes():
+def test_noise_is_removed_from_the_identity():
     functions, masses = eigenfunctions(MESH, TO)
     rng = np.random.default_rng(0)
-    truth = np.arange(len(masses))
-    noisy = np.where(rng.random(len(masses)) < 0.3, rng.permutation(len(masses)), truth)
+    identity = np.arange(len(masses))
+    noisy = np.where(rng.random(len(masses)) < 0.3, rng.permutation(len(masses)), identity)
 
     def error(match):
         return np.linalg.norm(MESH.vertices[match] - MESH.vertices, axis=1).mean()
@@ -37,12 +37,12 @@ def test_noise_goes():
     assert error(zoomout(functions, masses, functions, noisy)) < 0.1 * error(noisy)
 
 
-def test_the_truth_stays():
+def test_the_identity_is_unchanged():
     functions, masses = eigenfunctions(MESH, TO)
-    truth = np.arange(len(masses))
-    np.testing.assert_array_equal(zoomout(functions, masses, functions, truth), truth)
+    identity = np.arange(len(masses))
+    np.testing.assert_array_equal(zoomout(functions, masses, functions, identity), identity)
 
 
-def test_a_mesh_that_is_too_small_is_refused():
-    with pytest.raises(MeshError, match="80 eigenfunctions of 42 vertices"):
+def test_too_small_a_mesh_is_refused():
+    with pytest.raises(MeshError, match="80 eigenfunctions need more than 80 vertices, got 42"):
         eigenfunctions(bumpy_sphere(subdivisions=1), 80)

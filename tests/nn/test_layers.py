@@ -1,4 +1,4 @@
-"""The spiral layers against the plain operators of PyTorch that they stand for."""
+"""The spiral layers equal the PyTorch operators that they implement."""
 
 import numpy as np
 import pytest
@@ -11,6 +11,7 @@ from meshspiral.nn.layers import SpiralLinear, SpiralLSTM, metric_features
 
 
 def sequences(vertices, length, padded, seed=0):
+    """Random spirals, int64 [vertices, length]; if padded, their lengths include 1 and `length`."""
     rng = torch.Generator().manual_seed(seed)
     shift = torch.stack(
         [1 + torch.randperm(vertices - 1, generator=rng)[: length - 1] for _ in range(vertices)]
@@ -24,7 +25,8 @@ def sequences(vertices, length, padded, seed=0):
     return spirals
 
 
-def metric_by_hand(vertices, spirals, unit):
+def reference_metric(vertices, spirals, unit):
+    """The definition of `metric_features`, element by element, with arccos."""
     out = np.zeros((*spirals.shape, 2))
     for v, spiral in enumerate(spirals):
         a = vertices[spiral[0]]
@@ -43,15 +45,15 @@ def test_metric_features_are_distance_and_angle():
     vertices = torch.randn(12, 3, dtype=torch.float64)
     spirals = sequences(12, 7, padded=True)
     features = metric_features(vertices, spirals, 0.7)
-    expected = metric_by_hand(vertices.numpy(), spirals.numpy(), 0.7)
+    expected = reference_metric(vertices.numpy(), spirals.numpy(), 0.7)
     np.testing.assert_allclose(features, expected, atol=1e-10)
 
 
-def test_metric_features_do_not_depend_on_place_turn_and_scale():
+def test_metric_features_are_invariant_to_translation_rotation_and_scale():
     vertices = torch.randn(20, 3, dtype=torch.float64)
     spirals = sequences(20, 9, padded=False)
-    turn, _ = torch.linalg.qr(torch.randn(3, 3, dtype=torch.float64))
-    moved = 1000 * vertices @ turn + 5
+    rotation, _ = torch.linalg.qr(torch.randn(3, 3, dtype=torch.float64))
+    moved = 1000 * vertices @ rotation + 5
     torch.testing.assert_close(
         metric_features(vertices, spirals, 0.3), metric_features(moved, spirals, 300.0)
     )
@@ -64,14 +66,14 @@ def test_metric_features_of_a_right_angle():
     torch.testing.assert_close(features, torch.tensor(expected, dtype=torch.float32))
 
 
-def test_coincident_vertices_give_finite_features():
+def test_coincident_vertices_have_distance_and_angle_zero():
     vertices = torch.zeros(4, 3)
     features = metric_features(vertices, torch.tensor([[0, 1, 2, 3]]), 1.0)
-    assert torch.isfinite(features).all()
+    assert torch.equal(features, torch.zeros(1, 4, 2))
 
 
 def gather(features, spirals):
-    """features[spirals], with zeros where a spiral has ended."""
+    """features[spirals], with zeros at padding."""
     return features[spirals] * (spirals >= 0)[..., None]
 
 
@@ -95,41 +97,41 @@ def test_spiral_linear_is_one_linear_map_of_the_sequence(metric, padded):
 
 @pytest.mark.parametrize("rows", [1, 4, 1024])
 @pytest.mark.parametrize("padded", [False, True])
-def test_gradients_of_spiral_linear_are_those_of_the_gathered_sequence(padded, rows, monkeypatch):
+def test_spiral_linear_has_the_gradients_of_a_linear_map(padded, rows, monkeypatch):
     monkeypatch.setattr(layers, "ROWS", rows)
     layer = SpiralLinear(5, 4, 6).double()
     features = torch.randn(11, 5, dtype=torch.float64, requires_grad=True)
     spirals = sequences(11, 6, padded)
     out, expected = layer(features, spirals), layer.linear(gather(features, spirals).flatten(1))
     torch.testing.assert_close(out, expected, rtol=0, atol=1e-12)
-    upstream, of = torch.randn_like(out), [features, layer.linear.weight, layer.linear.bias]
-    ours, theirs = (torch.autograd.grad(x, of, upstream) for x in (out, expected))
-    for a, b in zip(ours, theirs, strict=True):
+    upstream, inputs = torch.randn_like(out), [features, layer.linear.weight, layer.linear.bias]
+    actual, reference = (torch.autograd.grad(x, inputs, upstream) for x in (out, expected))
+    for a, b in zip(actual, reference, strict=True):
         torch.testing.assert_close(a, b, rtol=0, atol=1e-12)
 
 
-def test_spiral_linear_under_autocast_multiplies_in_bf16_and_adds_up_in_float32():
+def test_spiral_linear_under_autocast_multiplies_in_bf16_and_sums_in_float32():
     layer = SpiralLinear(8, 16, 6)
     features, spirals = torch.randn(3000, 8, requires_grad=True), sequences(3000, 6, padded=True)
-    of = [features, layer.linear.weight, layer.linear.bias]
+    inputs = [features, layer.linear.weight, layer.linear.bias]
     exact = layer(features, spirals)
     with torch.autocast("cpu", torch.bfloat16):
         out = layer(features, spirals)
     assert out.dtype == torch.bfloat16
     torch.testing.assert_close(out.float(), exact, rtol=0, atol=0.05)
-    ours, theirs = (torch.autograd.grad(x.float().sum(), of) for x in (out, exact))
-    for a, b in zip(ours, theirs, strict=True):
+    actual, reference = (torch.autograd.grad(x.float().sum(), inputs) for x in (out, exact))
+    for a, b in zip(actual, reference, strict=True):
         assert a.dtype == torch.float32
         torch.testing.assert_close(a, b, rtol=0, atol=0.01 * float(b.abs().max()))
 
 
-def test_spiral_linear_refuses_another_length():
+def test_spiral_linear_rejects_another_length():
     with pytest.raises(ValueError, match="length 6, got 5"):
         SpiralLinear(5, 4, 6)(torch.randn(9, 5), sequences(9, 5, False))
 
 
 def reference_lstm(layer: SpiralLSTM, metric: bool) -> nn.LSTM:
-    """torch.nn.LSTM with the layer's weights; its second bias is 0."""
+    """A torch.nn.LSTM with the weights of the layer; its second bias is 0."""
     hidden = layer.hidden.in_features
     lstm = nn.LSTM(layer.input.in_features + 2 * metric, hidden, batch_first=True).double()
     weight = [layer.input.weight, layer.metric.weight] if metric else [layer.input.weight]
@@ -143,7 +145,7 @@ def reference_lstm(layer: SpiralLSTM, metric: bool) -> nn.LSTM:
 
 @pytest.mark.parametrize("metric", [False, True])
 @pytest.mark.parametrize("padded", [False, True])
-def test_spiral_lstm_is_the_last_real_output_of_an_lstm(metric, padded):
+def test_spiral_lstm_is_the_last_output_of_an_lstm_before_padding(metric, padded):
     layer = SpiralLSTM(5, 7, metric).double()
     features = torch.randn(13, 5, dtype=torch.float64, requires_grad=True)
     spirals = sequences(13, 6, padded)
@@ -172,7 +174,7 @@ def test_spiral_lstm_is_the_last_real_output_of_an_lstm(metric, padded):
 
 
 @pytest.mark.parametrize("rows", [1, 5, 13, 512])
-def test_an_lstm_over_few_sequences_at_a_time_is_the_same(rows, monkeypatch):
+def test_the_chunk_size_does_not_change_an_lstm(rows, monkeypatch):
     layer = SpiralLSTM(5, 7, metric=True).double()
     features, spirals = torch.randn(13, 5, dtype=torch.float64), sequences(13, 6, padded=True)
     extra = torch.randn(13, 6, 2, dtype=torch.float64)
@@ -187,19 +189,19 @@ def test_an_lstm_over_few_sequences_at_a_time_is_the_same(rows, monkeypatch):
     monkeypatch.setattr(recurrence, "ROWS", rows)
     for a, b in zip(run(), whole, strict=True):
         torch.testing.assert_close(a, b, rtol=0, atol=1e-12)
-    with torch.no_grad():  # which keeps but two steps
+    with torch.no_grad():  # uses buffers for two steps only
         torch.testing.assert_close(layer(features, spirals, extra), whole[0], rtol=0, atol=1e-12)
 
 
-def test_an_lstm_s_gradient_is_formed_once():
+def test_backward_of_an_lstm_runs_only_once():
     layer = SpiralLSTM(3, 4)
     out = layer(torch.randn(9, 3), sequences(9, 5, padded=False)).sum()
     out.backward(retain_graph=True)
-    with pytest.raises(RuntimeError, match="can be formed once"):
+    with pytest.raises(RuntimeError, match="can run only once"):
         out.backward()
 
 
-def test_an_lstm_under_autocast_multiplies_in_bf16_and_remembers_in_float32():
+def test_an_lstm_under_autocast_multiplies_in_bf16_and_has_float32_states():
     layer = SpiralLSTM(8, 16)
     features, spirals = torch.randn(40, 8, requires_grad=True), sequences(40, 20, padded=True)
     exact = layer(features, spirals)
@@ -215,7 +217,7 @@ def test_an_lstm_under_autocast_multiplies_in_bf16_and_remembers_in_float32():
         torch.testing.assert_close(a, b, rtol=0, atol=0.03 * float(b.abs().max()))
 
 
-def test_what_stands_in_the_padding_does_not_matter():
+def test_more_padding_does_not_change_an_lstm():
     layer = SpiralLSTM(3, 4)
     features, spirals = torch.randn(9, 3), sequences(9, 5, padded=True)
     longer = F.pad(spirals, (0, 4), value=-1)

@@ -1,4 +1,4 @@
-"""The chunked last layer against linear + cross-entropy."""
+"""The chunked last layer equals `F.linear` followed by `F.cross_entropy`."""
 
 import pytest
 import torch
@@ -19,43 +19,45 @@ def layer():
 
 
 @pytest.mark.parametrize("rows", [1, 7, 23, 512])
-def test_value_and_gradients_are_those_of_linear_and_cross_entropy(layer, rows, monkeypatch):
+def test_value_and_gradients_equal_those_of_linear_and_cross_entropy(layer, rows, monkeypatch):
     monkeypatch.setattr(module, "ROWS", rows)
     x, weight, bias, labels = layer
     loss = linear_cross_entropy(*layer)
-    plain = F.cross_entropy(F.linear(x, weight, bias), labels)
-    torch.testing.assert_close(loss, plain, rtol=0, atol=1e-12)
+    reference = F.cross_entropy(F.linear(x, weight, bias), labels)
+    torch.testing.assert_close(loss, reference, rtol=0, atol=1e-12)
     for a, b in zip(
         torch.autograd.grad(3 * loss, (x, weight, bias)),
-        torch.autograd.grad(3 * plain, (x, weight, bias)),
+        torch.autograd.grad(3 * reference, (x, weight, bias)),
         strict=True,
     ):
         torch.testing.assert_close(a, b, rtol=0, atol=1e-12)
 
 
-def test_gradients_are_the_limits_of_differences(layer):
+def test_gradients_equal_finite_differences(layer):
     x, weight, bias, labels = layer
     assert torch.autograd.gradcheck(lambda *a: linear_cross_entropy(*a, labels), (x, weight, bias))
 
 
-def test_very_large_scores_overflow_nothing(layer):
+def test_very_large_scores_do_not_overflow(layer):
     x, weight, bias, labels = layer
     loss = linear_cross_entropy((1e4 * x).float(), weight.float(), bias.float(), labels)
-    plain = F.cross_entropy(F.linear(1e4 * x, weight, bias), labels)
-    torch.testing.assert_close(loss.double(), plain, rtol=1e-5, atol=0)
+    reference = F.cross_entropy(F.linear(1e4 * x, weight, bias), labels)
+    torch.testing.assert_close(loss.double(), reference, rtol=1e-5, atol=0)
 
 
-def test_under_autocast_the_products_are_in_bf16_and_the_sums_are_not(layer):
+def test_autocast_multiplies_in_bf16_and_sums_in_float32(layer):
     x, weight, bias, labels = (t.detach().float() if t.is_floating_point() else t for t in layer)
     x.requires_grad_(), weight.requires_grad_()
     with torch.autocast("cpu", dtype=torch.bfloat16):
         loss = linear_cross_entropy(x, weight, bias, labels)
-    plain = F.cross_entropy(F.linear(x, weight, bias), labels)
+    reference = F.cross_entropy(F.linear(x, weight, bias), labels)
     assert loss.dtype == torch.float32
-    torch.testing.assert_close(loss, plain, rtol=2e-2, atol=0)
-    assert loss != plain
+    torch.testing.assert_close(loss, reference, rtol=2e-2, atol=0)
+    assert loss != reference
     for a, b in zip(
-        torch.autograd.grad(loss, (x, weight)), torch.autograd.grad(plain, (x, weight)), strict=True
+        torch.autograd.grad(loss, (x, weight)),
+        torch.autograd.grad(reference, (x, weight)),
+        strict=True,
     ):
         assert a.dtype == torch.float32
         torch.testing.assert_close(a, b, rtol=0, atol=2e-2)
@@ -76,7 +78,7 @@ def test_predict_is_the_argmax_and_the_loss(layer, rows, monkeypatch):
     scores = F.linear(x, weight, bias)
     torch.testing.assert_close(classes, scores.argmax(1))
     torch.testing.assert_close(probability, scores.softmax(1).amax(1), rtol=0, atol=1e-12)
-    right = scores.softmax(1).gather(1, labels[:, None])[:, 0]
-    torch.testing.assert_close(of_label, right, rtol=0, atol=1e-12)
+    label_probability = scores.softmax(1).gather(1, labels[:, None])[:, 0]
+    torch.testing.assert_close(of_label, label_probability, rtol=0, atol=1e-12)
     assert predict(*layer[:3]).loss is None and predict(*layer[:3]).of_label is None
     torch.testing.assert_close(loss, F.cross_entropy(scores, labels), rtol=0, atol=1e-12)

@@ -1,64 +1,73 @@
-"""The networks as one would first write them, to measure and to test the fast ones against.
-
-Neighbourhoods are gathered as they stand, the LSTM is `torch.nn.LSTM`, every rotation is written
-out, and all scores exist at once.
-"""
+"""The networks as one would first write them, to measure and to test the fast ones against."""
 
 from __future__ import annotations
+
+import copy
+from collections.abc import Callable
+from typing import Any
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+from meshspiral.neighbourhoods.base import Batch
 from meshspiral.nn.geodesic import GeodesicConv, Resampling
 from meshspiral.nn.layers import SpiralLinear, SpiralLSTM
 from meshspiral.nn.networks import Network
 
 
-class PlainNetwork(nn.Module):
-    """A copy of a network without metric information: the same weights, the same loss."""
+def reference_network(net: Network) -> Network:
+    """A copy of a network, with the same weights, in which reference layers replace fast ones.
 
-    def __init__(self, net: Network):
-        super().__init__()
-        self.lift, self.neck, self.head = (_linear(x) for x in (net.lift, net.neck, net.head))
-        self.layers = nn.ModuleList(PLAIN[type(layer)](layer) for layer in net.layers)
-        self.dropout = nn.Dropout(net.dropout.p)
-        self.feature_scale = net.feature_scale
+    A layer whose type has no entry in `REFERENCES` stays as it is; for a network of such layers
+    alone, the reference differs in the cross-entropy only.
 
-    def loss(self, features: Tensor, neighbourhood: Tensor | Resampling, labels: Tensor) -> Tensor:
-        x = self.dropout(torch.relu(self.lift(features * self.feature_scale)))
-        for layer in self.layers:
-            x = torch.relu(layer(x, neighbourhood))
-        x = self.dropout(torch.relu(self.neck(x)))
-        return F.cross_entropy(self.head(x), labels)
+    Args:
+        net: A network without metric information.
+    """
+    reference = copy.deepcopy(net)
+    for name, layer in net.named_modules():
+        if type(layer) in REFERENCES:
+            reference.set_submodule(name, REFERENCES[type(layer)](layer))
+    return reference
 
 
-class PlainSpiralLinear(nn.Module):
+def reference_loss(net: Network, batch: Batch) -> Tensor:
+    """The cross-entropy of a batch, with all scores in memory at once."""
+    return F.cross_entropy(net.head(net.embed_batch(batch)), batch["labels"])
+
+
+class ReferenceSpiralLinear(nn.Module):
+    """`SpiralLinear` on spirals without padding: all of them are gathered at once."""
+
     def __init__(self, layer: SpiralLinear):
         super().__init__()
-        self.linear = _linear(layer.linear)
+        self.linear = copy.deepcopy(layer.linear)
 
-    def forward(self, x: Tensor, spirals: Tensor) -> Tensor:
+    def forward(self, x: Tensor, spirals: Tensor, metric: None = None) -> Tensor:
         return self.linear(x[spirals].flatten(1))
 
 
-class PlainSpiralLSTM(nn.Module):
+class ReferenceSpiralLSTM(nn.Module):
+    """`SpiralLSTM` on spirals without padding: `torch.nn.LSTM` on the gathered spirals."""
+
     def __init__(self, layer: SpiralLSTM):
         super().__init__()
-        inputs, width = layer.input.in_features, layer.hidden.in_features
-        self.lstm = nn.LSTM(inputs, width, batch_first=True, dtype=layer.input.weight.dtype)
+        weight = layer.input.weight
+        sizes = layer.input.in_features, layer.hidden.in_features
+        self.lstm = nn.LSTM(*sizes, batch_first=True, device=weight.device, dtype=weight.dtype)
         with torch.no_grad():
-            self.lstm.weight_ih_l0.copy_(layer.input.weight)
+            self.lstm.weight_ih_l0.copy_(weight)
             self.lstm.weight_hh_l0.copy_(layer.hidden.weight)
             self.lstm.bias_ih_l0.copy_(layer.input.bias)
             self.lstm.bias_hh_l0.zero_()
 
-    def forward(self, x: Tensor, spirals: Tensor) -> Tensor:
+    def forward(self, x: Tensor, spirals: Tensor, metric: None = None) -> Tensor:
         return self.lstm(x[spirals])[1][0][0]
 
 
-class PlainGeodesicConv(nn.Module):
-    """Where every sample is there, and blended from three vertices."""
+class ReferenceGeodesicConv(nn.Module):
+    """`GeodesicConv` with every rotation of the template written out."""
 
     def __init__(self, layer: GeodesicConv):
         super().__init__()
@@ -66,22 +75,18 @@ class PlainGeodesicConv(nn.Module):
 
     def forward(self, x: Tensor, resampling: Resampling) -> Tensor:
         outs, rays, rings, channels = self.weight.shape
-        corners = x[resampling.vertices.view(-1, 3)]
-        samples = (corners * resampling.weights.view(-1, 3, 1).to(x.dtype)).sum(1)
-        # to turn the template is to turn the patches the other way, and the maximum does not mind
+        vertices, weights, first, *_ = resampling
+        terms = x[vertices] * weights[:, None].to(x.dtype)
+        rows = torch.arange(len(first) - 1, device=x.device).repeat_interleave(first.diff())
+        samples = x.new_zeros(len(first) - 1, channels).index_add(0, rows, terms)
+        # rotating the template instead of the patches gives the same set, in another order
         rotations = torch.stack([self.weight.roll(t, 1) for t in range(rays)])
         products = samples.view(-1, rays * rings * channels) @ rotations.view(rays * outs, -1).T
         return products.view(-1, rays, outs).amax(1)
 
 
-PLAIN = {
-    SpiralLinear: PlainSpiralLinear,
-    SpiralLSTM: PlainSpiralLSTM,
-    GeodesicConv: PlainGeodesicConv,
+REFERENCES: dict[type[nn.Module], Callable[[Any], nn.Module]] = {
+    SpiralLinear: ReferenceSpiralLinear,
+    SpiralLSTM: ReferenceSpiralLSTM,
+    GeodesicConv: ReferenceGeodesicConv,
 }
-
-
-def _linear(layer: nn.Linear) -> nn.Linear:
-    copy = nn.Linear(layer.in_features, layer.out_features, dtype=layer.weight.dtype)
-    copy.load_state_dict(layer.state_dict())
-    return copy

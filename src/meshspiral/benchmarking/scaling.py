@@ -1,99 +1,147 @@
-"""How the cost of a step grows with the sizes of its parts."""
+"""How the cost of a pass grows with each of its sizes."""
 
 from __future__ import annotations
+
+from typing import NamedTuple
 
 import numpy as np
 import torch
 from tqdm import tqdm
 
-from meshspiral.benchmarking import measure
-from meshspiral.data.preprocessing import by_rows_and_columns
-from meshspiral.nn.geodesic import Resampling
+from meshspiral.benchmarking.inputs import build_network, torus_batch
+from meshspiral.benchmarking.measure import Action, Row, in_own_process, medians, peak_bytes
+from meshspiral.benchmarking.memory import too_large
+from meshspiral.data.datamodule import draw
+from meshspiral.experiment.schema import BenchmarkConfig, TrainConfig, load_plugins
+from meshspiral.neighbourhoods import Neighbourhood
 from meshspiral.nn.loss import linear_cross_entropy
-from meshspiral.nn.networks import GCNN3, FCSNet, LSTMNet
-from meshspiral.training.memory import keep_freed_memory
+from meshspiral.nn.networks import Network
+from meshspiral.nn.networks.base import LAST
+from meshspiral.training.device import keep_freed_memory, set_up_process
 
-VERTICES, TEMPLATE, LENGTH = 6890, 1500, 20  # what does not grow
 SIZES = [1500, 3000, 6000, 12_000, 25_000, 50_000, 100_000]
 LENGTHS = [10, 15, 20, 30, 40, 60]
-# (what, over, sizes); LSTM-NET keeps all its steps for its gradient: 25,000 vertices take 8 GB
-SERIES = [
-    ("FCS-NET", "vertices", SIZES),
-    ("LSTM-NET", "vertices", SIZES[:5]),
-    ("GCNN3", "vertices", SIZES),
-    ("head", "vertices", SIZES),
-    ("FCS-NET", "N", LENGTHS),
-    ("LSTM-NET", "N", LENGTHS),
-    ("head", "template", SIZES),
-]
+TEMPLATE = 1500  # vertices of the template where it does not grow
 
 
-def growth(repeats: int) -> list[dict[str, object]]:
-    """For each series: seconds and megabytes of one forward and backward pass at each size, and
-    their exponents over the upper half of the sizes.
+class Series(NamedTuple):
+    """One size that grows.
 
-    Networks are without their last layer, which is "head", with its cross-entropy. Megabytes are
-    those beyond parameters and inputs; None where the system can't say.
+    Attributes:
+        network: The network without its last layer; None for the last layer and its cross-entropy.
+        over: "vertices", "N" or "template".
+        sizes: The values of that size, ascending.
+    """
+
+    network: TrainConfig | None
+    over: str
+    sizes: list[int]
+
+    @property
+    def what(self) -> str:
+        """The network's title, or "head"."""
+        return "head" if self.network is None else Network.registered[self.network.model.name].title
+
+
+def all_series(networks: list[TrainConfig]) -> list[Series]:
+    """Each network over the vertices, and over N if its neighbourhood has `seq_len`; the head over
+    the vertices and over the template."""
+    return [
+        *(Series(network, "vertices", SIZES) for network in networks),
+        Series(None, "vertices", SIZES),
+        *(Series(n, "N", LENGTHS) for n in networks if hasattr(n.neighbourhood, "seq_len")),
+        Series(None, "template", SIZES),
+    ]
+
+
+def scaling_rows(config: BenchmarkConfig, networks: list[TrainConfig]) -> list[Row]:
+    """A row for each series: its sizes, and the cost of one forward and backward pass at each.
+
+    "MB" are those beyond parameters and inputs; None on systems other than Linux. The exponents are
+    those of the upper half of the sizes. A series stops before a size that would take more than
+    half of the free memory, by extrapolation in proportion; "stopped" says where.
     """
     rows = []
-    for what, over, sizes in SERIES:
-        row: dict[str, object] = {"what": what, "over": over, "sizes": sizes}
-        found = [
-            measure.in_own_process(cost, what, over, size, repeats)
-            for size in tqdm(sizes, desc=f"{what} over {over}")
-        ]
-        for unit, values in zip(("seconds", "MB"), zip(*found, strict=True), strict=True):
-            row[f"exponent of {unit}"] = exponent(sizes, values)
-            row[unit] = values
-        rows.append(row)
+    for series in all_series(networks):
+        costs: list[tuple[float, float | None]] = []
+        stopped = ""
+        for size in tqdm(series.sizes, desc=f"{series.what} over {series.over}"):
+            if costs and costs[-1][1] is not None:
+                expected = costs[-1][1] * size / series.sizes[len(costs) - 1]
+                if too_large(1e6 * expected):
+                    stopped = f"before {size:,}: about {expected / 1e3:.1f} GB"
+                    break
+            costs.append(in_own_process(pass_cost, config, series, size))
+        seconds, megabytes = (list(values) for values in zip(*costs, strict=True))
+        sizes = series.sizes[: len(costs)]
+        rows.append(
+            {
+                "what": series.what,
+                "over": series.over,
+                "sizes": sizes,
+                "exponent of seconds": exponent(sizes, seconds),
+                "seconds": seconds,
+                "exponent of MB": exponent(sizes, megabytes),
+                "MB": megabytes,
+                "stopped": stopped,
+            }
+        )
     return rows
 
 
 def exponent(sizes: list[int], values: list[float | None]) -> float | None:
-    """The slope of a line through the upper half, both axes logarithmic."""
+    """The slope of a line through the upper half of the values, both axes logarithmic.
+
+    Returns:
+        The slope; None if a value is missing, or if there is one value only.
+    """
     upper = slice(len(sizes) // 2, None)
-    if None in values:
+    if None in values or len(sizes[upper]) < 2:
         return None
     return float(np.polyfit(np.log(sizes[upper]), np.log(values[upper]), 1)[0])
 
 
-def cost(what: str, over: str, size: int, repeats: int) -> tuple[float, float | None]:
-    """(seconds, megabytes) of one pass, in a process that has done nothing else."""
-    torch.set_flush_denormal(True)
-    action = one_pass(what, **{over: size})
-    peak = measure.peak_bytes(action)
-    keep_freed_memory()  # as in training; before, it would have hidden memory that is used again
-    seconds = measure.medians({"it": action}, repeats)["it"]
+def pass_cost(config: BenchmarkConfig, series: Series, size: int) -> tuple[float, float | None]:
+    """The cost of one pass, to be called in a process of its own.
+
+    Returns:
+        Seconds and megabytes.
+    """
+    load_plugins(config.plugins)
+    set_up_process(config.threads)
+    action = one_pass(series, size, config.vertices)
+    peak = peak_bytes(action)
+    keep_freed_memory()  # as in training; earlier, it would hide memory that is used again
+    seconds = medians({"pass": action}, config.repeats)["pass"]
     return seconds, None if peak is None else peak / 1e6
 
 
-def one_pass(what: str, vertices: int = VERTICES, template: int = TEMPLATE, N: int = LENGTH):
-    """An action: forward and backward, on random inputs of these sizes."""
-    features, spirals, labels = measure.random_inputs(vertices, template, N)
-    if what == "head":
-        x = features[:, :256].clone().requires_grad_()
-        weight, bias = (torch.randn(template, 256) / 16).requires_grad_(), torch.zeros(template)
-        return lambda: linear_cross_entropy(x, weight, bias, labels).backward()
-    make = {
-        "FCS-NET": lambda: FCSNet(544, 10, N, feature_scale=measure.SCALE),
-        "LSTM-NET": lambda: LSTMNet(544, 10, feature_scale=measure.SCALE),
-        "GCNN3": lambda: GCNN3(544, 10, feature_scale=measure.SCALE),
-    }
-    net = make[what]()
-    around = random_patches(vertices) if what == "GCNN3" else spirals
-    return lambda: net.embed(features, around).sum().backward()
+def one_pass(series: Series, size: int, vertices: int) -> Action:
+    """An action: a forward and a backward pass.
+
+    Args:
+        series: What to measure.
+        size: The value of the size that grows.
+        vertices: Number of vertices where it does not grow.
+    """
+    network = series.network
+    if series.over == "vertices":
+        vertices = size
+    if network is None:
+        return head_pass(vertices, size if series.over == "template" else TEMPLATE)
+    if series.over == "N":
+        around = network.neighbourhood.model_copy(update={"seq_len": size})
+        network = network.model_copy(update={"neighbourhood": around})
+    batch = torus_batch(network, vertices, TEMPLATE)
+    batch = draw(Neighbourhood.of(network.neighbourhood), batch, network.seed)
+    net = build_network(network, num_classes=10)
+    return lambda: net.embed_batch(batch).sum().backward()
 
 
-def random_patches(vertices: int, rings: int = 5, rays: int = 16) -> Resampling:
-    """Samples of three vertices nearby, for sizes of which there is no body."""
-    rng = np.random.default_rng(0)
-    samples = vertices * rings * rays
-    centres = np.repeat(np.arange(vertices), 3 * rings * rays)
-    indices = (centres + rng.integers(-200, 200, 3 * samples)) % vertices
-    arrays = {
-        "indices": indices.astype(np.int32),
-        "weights": np.full(3 * samples, 1 / 3, np.float32),
-        "first": 3 * np.arange(samples + 1, dtype=np.int32),
-    }
-    columns = by_rows_and_columns(arrays, vertices)
-    return Resampling(**{name: torch.from_numpy(array) for name, array in columns.items()})
+def head_pass(vertices: int, template: int) -> Action:
+    """The same for the last layer and its cross-entropy, on random inputs."""
+    x = torch.randn(vertices, LAST).requires_grad_()
+    weight = (torch.randn(template, LAST) / LAST**0.5).requires_grad_()
+    bias = torch.zeros(template).requires_grad_()
+    labels = torch.randint(template, (vertices,))
+    return lambda: linear_cross_entropy(x, weight, bias, labels).backward()

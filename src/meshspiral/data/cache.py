@@ -1,13 +1,9 @@
-"""Arrays on disk under a key of all that they depend on, computed once."""
+"""A cache of arrays on disk; the key hashes everything that a result depends on."""
 
 from __future__ import annotations
 
-import contextlib
-import hashlib
 import inspect
 import logging
-import os
-import uuid
 import zipfile
 import zlib
 from collections.abc import Callable
@@ -17,56 +13,51 @@ from types import ModuleType
 
 import numpy as np
 
+from meshspiral.data.files import atomic_file
+from meshspiral.geometry.digest import digest
+from meshspiral.neighbourhoods.base import Arrays
+
 log = logging.getLogger(__name__)
 
-Arrays = dict[str, np.ndarray]
 
-
-class StoreError(OSError):
-    """The cache can't be written; the message names the folder and the reason."""
-
-
-def digest(*parts: np.ndarray | str | float | None) -> str:
-    """A hexadecimal SHA-256 of arrays (dtype, shape and content) and plain values, in order."""
-    sha = hashlib.sha256()
-    for part in parts:
-        if isinstance(part, np.ndarray):
-            sha.update(f"|{part.dtype.str}{part.shape}|".encode())
-            sha.update(np.ascontiguousarray(part).data)
-        else:
-            sha.update(f"|{part!r}|".encode())
-    return sha.hexdigest()
+class CacheError(OSError):
+    """The cache cannot be written. The message names the folder and the reason."""
 
 
 @cache
 def code_version(*modules: ModuleType) -> str:
-    """A hash of the modules' source: results of other code are never taken for this one's."""
+    """A hash of the modules' source code, so that a change of code invalidates its results."""
     return digest(*(inspect.getsource(module) for module in modules))
 
 
-class Store:
+class Cache:
     """A folder of .npz files, one per result, named by kind and key.
 
-    Several processes may use one folder: files appear whole or not at all, and a result computed
-    twice is the same result. A file that is truncated, damaged or not one of ours is reported,
-    computed again and replaced.
+    Several processes may share one folder: files are written atomically, and two processes that
+    compute the same key write equal arrays. A truncated, damaged or foreign file is reported with a
+    warning, computed again and replaced.
+
+    Args:
+        root: The folder; it is created when the first result is saved.
     """
 
     def __init__(self, root: str | Path):
         self.root = Path(root)
 
     def path(self, kind: str, key: str) -> Path:
+        """The file of a result, whether or not it exists."""
         return self.root / kind / f"{key}.npz"
 
     def has(self, kind: str, key: str) -> bool:
+        """Whether there is a file for a result; its content is not checked."""
         return self.path(kind, key).is_file()
 
     def load(self, kind: str, key: str) -> Arrays | None:
-        """The arrays kept under that key; None if there are none, or none that can be trusted."""
+        """Load the arrays of a result; None if its file is missing, damaged or foreign."""
         path = self.path(kind, key)
         try:
             with np.load(path, allow_pickle=False) as file:
-                arrays = {name: file[name] for name in file.files}  # reading checks each CRC
+                arrays = {name: file[name] for name in file.files}  # reading checks the CRC
         except FileNotFoundError:
             return None
         except (
@@ -82,32 +73,39 @@ class Store:
             log.warning("%s is damaged (%s); computing it again", path, error)
             return None
         if arrays.pop("key", np.array([])).tolist() != [key, *sorted(arrays)]:
-            log.warning("%s is not what its name says; computing it again", path)
+            log.warning("%s holds another result than its name says; computing it again", path)
             return None
         return arrays
 
     def save(self, kind: str, key: str, arrays: Arrays) -> None:
-        """Keep arrays under a key. Errors: StoreError if the folder can't be written."""
+        """Save the arrays of a result, replacing its file if there is one.
+
+        Raises:
+            CacheError: The folder cannot be written.
+        """
         path = self.path(kind, key)
-        temporary = path.with_name(f"{uuid.uuid4().hex}.tmp")
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
-            with open(temporary, "xb") as file:  # as readable for others as the umask says
+            with atomic_file(path) as file:
                 np.savez(file, key=np.array([key, *sorted(arrays)]), **arrays)
-            os.replace(temporary, path)
-        except BaseException as error:
-            with contextlib.suppress(OSError):
-                temporary.unlink()
-            if isinstance(error, OSError):
-                reason = error.strerror or error
-                raise StoreError(
-                    f"cannot write the cache {self.root} ({reason}); "
-                    "make room, or choose another folder with data.cache_dir="
-                ) from error
-            raise
+        except OSError as error:
+            reason = error.strerror or error
+            raise CacheError(
+                f"cannot write the cache {self.root} ({reason}); check its free space and "
+                "permissions, or choose another folder with data.cache_dir=/path/to/folder"
+            ) from error
 
     def get(self, kind: str, key: str, compute: Callable[[], Arrays]) -> Arrays:
-        """The arrays under that key, computed and kept if they are not there."""
+        """Load the arrays of a result, or compute and save them.
+
+        Args:
+            kind: Kind of the result, the name of a subfolder.
+            key: Hash of everything that the result depends on.
+            compute: Computes the arrays.
+
+        Raises:
+            CacheError: The folder cannot be written.
+        """
         arrays = self.load(kind, key)
         if arrays is None:
             arrays = compute()
@@ -115,7 +113,7 @@ class Store:
         return arrays
 
     def size(self) -> int:
-        """Bytes of all results."""
+        """Total size of all results in bytes."""
         total = 0
         for path in self.root.rglob("*.npz"):
             try:

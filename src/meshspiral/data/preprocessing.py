@@ -1,67 +1,33 @@
-"""From a mesh to the arrays that a network reads, each computed once and kept."""
+"""From a mesh to the arrays that a network reads, each computed once and cached."""
 
 from __future__ import annotations
 
+import inspect
 import os
 import random
 import sys
 import time
 from collections.abc import Callable, Iterable
-from dataclasses import astuple, dataclass
+from dataclasses import dataclass
 
 import numpy as np
-from joblib import Parallel, cpu_count, delayed
-from joblib.externals.loky.process_executor import TerminatedWorkerError
-from scipy.sparse import csr_array
+from joblib import cpu_count
 from tqdm import tqdm
 
-from meshspiral.data.cache import Arrays, Store, code_version, digest
-from meshspiral.data.shapes import DataError
-from meshspiral.geometry import (
-    angles,
-    connectivity,
-    geodesics,
-    mesh,
-    patches,
-    shot,
-    spirals,
-    windows,
-)
+from meshspiral.data.cache import Arrays, Cache, code_version
+from meshspiral.data.pool import run_in_pool
+from meshspiral.data.settings import ShotSettings
+from meshspiral.geometry import angles, mesh, shot
+from meshspiral.geometry.digest import digest
 from meshspiral.geometry.mesh import Mesh, MeshError
+from meshspiral.neighbourhoods import Neighbourhood
 
-
-@dataclass(frozen=True)
-class PatchRecipe:
-    """The polar grid around every vertex, its first ray in a direction drawn at random.
-
-    radius: over the mesh's geodesic diameter. weights: how a sample is blended from vertices; by
-    "interpolation" in the triangle it lies in, or by the "gaussian" windows of the original.
-    """
-
-    radius: float
-    rings: int = 5
-    rays: int = 16
-    weights: str = "interpolation"
-
-
-@dataclass(frozen=True)
-class Recipe:
-    """What is computed of each mesh: its descriptors, and either spirals or patches.
-
-    shot_radius: over the square root of the mesh's surface area. shot_bins: of the cosine.
-    seq_len or rings: of spirals, one of them, see `spiral_table`. patch: of patches.
-    """
-
-    shot_radius: float
-    shot_bins: int
-    seq_len: int | None = None
-    rings: int | None = None
-    patch: PatchRecipe | None = None
+POOL_START = 6.0  # seconds that starting the worker processes takes
 
 
 @dataclass(frozen=True, eq=False)
 class Task:
-    """One result: kept under `key`, computed by `compute(*arguments)`."""
+    """One result: `compute(*arguments)`, cached as `kind` under `key`."""
 
     kind: str
     key: str
@@ -69,39 +35,29 @@ class Task:
     arguments: tuple
 
 
-def descriptor_task(mesh_: Mesh, recipe: Recipe) -> Task:
-    """SHOT: `features` float32 [V, 32 (bins + 1)], zeros where undefined; `undefined`: how many."""
+def descriptor_task(mesh_: Mesh, settings: ShotSettings) -> Task:
+    """SHOT descriptors: `features` float32 [V, 32 (bins + 1)], zeros where SHOT is undefined, and
+    `undefined`, the number of such vertices."""
     version = code_version(angles, mesh, shot, sys.modules[__name__])
-    key = digest(mesh_.vertices, mesh_.faces, recipe.shot_radius, recipe.shot_bins, version)
-    return Task("shot", key, _descriptors, (mesh_, recipe.shot_radius, recipe.shot_bins))
+    key = digest(mesh_.vertices, mesh_.faces, settings.radius, settings.bins, version)
+    return Task("shot", key, _descriptors, (mesh_, settings.radius, settings.bins))
 
 
-def spiral_task(mesh_: Mesh, recipe: Recipe) -> Task:
-    """`sequences` and `first` of `SpiralTable`, kept by one-rings: one table serves all poses."""
-    version = code_version(connectivity, spirals, sys.modules[__name__])
-    rings = connectivity.one_rings(mesh_)
-    key = digest(*rings, recipe.seq_len, recipe.rings, version)
-    return Task("spirals", key, _spirals, (mesh_, recipe.seq_len, recipe.rings))
-
-
-def patch_task(mesh_: Mesh, recipe: Recipe) -> Task:
-    """`indices` int32 [E], `weights` float32 [E] and `first` int32 [S+1]: sample s is the sum over
-    k in first[s]:first[s+1] of weights[k] f[indices[k]]; samples by vertex, then ray, then ring."""
-    version = code_version(connectivity, geodesics, patches, windows, sys.modules[__name__])
-    key = digest(mesh_.vertices, mesh_.faces, *astuple(recipe.patch), version)
-    return Task("patches", key, _patches, (mesh_, recipe.patch))
-
-
-def neighbourhood_task(mesh_: Mesh, recipe: Recipe) -> Task:
-    """Spirals or patches, whichever the recipe asks for."""
-    return (patch_task if recipe.patch else spiral_task)(mesh_, recipe)
+def neighbourhood_task(mesh_: Mesh, neighbourhood: Neighbourhood) -> Task:
+    """The arrays of a neighbourhood, see its `compute`."""
+    classes = [cls for cls in type(neighbourhood).__mro__ if issubclass(cls, Neighbourhood)]
+    sources = [inspect.getmodule(cls) for cls in classes if cls is not Neighbourhood]
+    version = code_version(*neighbourhood.modules, *sources)
+    settings = sorted(neighbourhood.settings.model_dump().items())
+    key = digest(repr(settings), *neighbourhood.mesh_key(mesh_), version)
+    return Task(neighbourhood.name, key, neighbourhood.compute, (mesh_,))
 
 
 def _descriptors(mesh_: Mesh, radius: float, bins: int) -> Arrays:
     if mesh_.area == 0:
-        raise MeshError(f"{mesh_.name}: no surface area, so there is no scale to describe it at")
+        raise MeshError(f"{mesh_.name}: surface area must be above 0 to scale descriptors, got 0")
     length = radius * np.sqrt(mesh_.area)
-    # far from the origin float32, in which SHOT is defined, would have no digits left
+    # SHOT is defined in float32, which has no digits left far from the origin
     centred = mesh_.vertices - mesh_.vertices.mean(axis=0)
     features = shot.shot_descriptors(centred, mesh_.vertex_normals, length, bins)
     undefined = np.isnan(features).any(axis=1)
@@ -109,102 +65,48 @@ def _descriptors(mesh_: Mesh, radius: float, bins: int) -> Arrays:
     return {"features": features, "undefined": np.array(undefined.sum())}
 
 
-def _spirals(mesh_: Mesh, seq_len: int | None, rings: int | None) -> Arrays:
-    table = spirals.spiral_table(mesh_, seq_len, rings=rings)
-    return {"sequences": table.sequences, "first": table.first}
+def run_tasks(tasks: Iterable[Task], cache: Cache, workers: int | None, description: str) -> None:
+    """Compute and cache what the cache lacks, with a progress bar.
 
+    The order is random and differs between processes, so that jobs of a sweep that start together
+    share the work. Worker processes are started only if the remaining work would take longer than
+    starting them.
 
-def _patches(mesh_: Mesh, patch: PatchRecipe) -> Arrays:
-    radius = patch.radius * geodesics.diameter(mesh_)
-    grid = (radius, patch.rings, patch.rays, first_directions(mesh_))
-    if patch.weights == "gaussian":
-        indices, weights, first = windows.gaussian_windows(mesh_, *grid)
-    else:
-        table = patches.geodesic_patches(mesh_, *grid)
-        whole = table.whole.ravel()
-        indices, weights = (array.reshape(-1, 3)[whole].ravel() for array in table)
-        first = 3 * np.concatenate([[0], np.cumsum(whole)])
-    samples = csr_array((weights, indices, first), shape=(len(first) - 1, len(mesh_.vertices)))
-    rows = np.arange(len(first) - 1).reshape(-1, patch.rings, patch.rays)
-    by_ray = samples[rows.transpose(0, 2, 1).ravel()]
-    return {
-        "indices": by_ray.indices.astype(np.int32),
-        "weights": by_ray.data,
-        "first": by_ray.indptr.astype(np.int32),
-    }
+    Args:
+        tasks: Several tasks may have one key.
+        cache: Where results go.
+        workers: Number of processes; None for one per core.
+        description: Label of the progress bar.
 
-
-def first_directions(mesh_: Mesh) -> np.ndarray:
-    """float64 [V]: where the grid of each vertex begins, at random, and always alike for one mesh.
-
-    Else the grids of registered meshes would all begin at the same edges, and a network would know
-    its vertices by them.
+    Raises:
+        DataError: A worker process was killed.
+        CacheError: The cache cannot be written.
+        MeshError: A mesh cannot be described.
     """
-    rng = np.random.default_rng(int(digest(mesh_.vertices, mesh_.faces)[:15], 16))
-    return rng.uniform(0, 2 * np.pi, len(mesh_.vertices))
-
-
-def by_rows_and_columns(arrays: Arrays, vertices: int) -> Arrays:
-    """The samples of `patch_task` for a mesh of so many vertices, as a network reads them: see
-    `meshspiral.nn.geodesic.Resampling`."""
-    rows = csr_array(
-        (arrays["weights"], arrays["indices"], arrays["first"]),
-        shape=(len(arrays["first"]) - 1, vertices),
-    )
-    columns = rows.tocsc()
-    return {
-        "vertices": rows.indices,
-        "weights": rows.data,
-        "first": rows.indptr,
-        "samples": columns.indices,
-        "sample_weights": columns.data,
-        "sample_first": columns.indptr,
-    }
-
-
-def run_tasks(tasks: Iterable[Task], store: Store, workers: int | None, description: str) -> None:
-    """Compute and keep what the store lacks, with a progress bar, in an order of this process's
-    own: the jobs of a sweep that begin together share the work.
-
-    workers: processes; None for one per core. Other processes are started only when what remains
-    would keep this one busy for longer than their start takes.
-    """
-    missing = {task.key: task for task in tasks if not store.has(task.kind, task.key)}
+    missing = {task.key: task for task in tasks if not cache.has(task.kind, task.key)}
     queue = list(missing.values())
     random.Random(os.getpid()).shuffle(queue)
     workers = min(workers or cpu_count(), len(queue))
-    progress = tqdm(total=len(queue), desc=description, delay=1.0)
-    with progress:
+    with tqdm(total=len(queue), desc=description, delay=1.0) as progress:
         started = None
         for done, task in enumerate(queue):
             if workers > 1 and done > 1:
                 remaining = (time.perf_counter() - started) / (done - 1) * (len(queue) - done)
-                if remaining > 6.0:
-                    _run_in_pool(queue[done:], store, workers, progress)
+                if remaining > POOL_START:
+                    jobs = ((task, cache) for task in queue[done:])
+                    for _ in run_in_pool(_run, jobs, workers, "data.workers=1"):
+                        progress.update()
                     return
-            _run(task, store)
+            _run(task, cache)
             progress.update()
-            started = started or time.perf_counter()  # after the first task: that one compiles
+            started = started or time.perf_counter()  # after the first task, which compiles
 
 
-def _run(task: Task, store: Store) -> None:
-    if not store.has(task.kind, task.key):  # another process may have been here
-        store.save(task.kind, task.key, task.compute(*task.arguments))
+def _run(task: Task, cache: Cache) -> None:
+    if not cache.has(task.kind, task.key):  # another process may have computed it meanwhile
+        cache.save(task.kind, task.key, task.compute(*task.arguments))
 
 
-def _run_in_pool(tasks: list[Task], store: Store, workers: int, progress: tqdm) -> None:
-    # idle workers would stay for five minutes, with their memory
-    pool = Parallel(n_jobs=workers, return_as="generator_unordered", idle_worker_timeout=2)
-    try:
-        for _ in pool(delayed(_run)(task, store) for task in tasks):
-            progress.update()
-    except TerminatedWorkerError as error:
-        raise DataError(
-            "a process was killed, probably for lack of memory: data.workers=1 needs "
-            "less; the same command goes on"
-        ) from error
-
-
-def load_task(task: Task, store: Store) -> Arrays:
-    """The result of a task, from the store if it is there and sound, else computed again."""
-    return store.get(task.kind, task.key, lambda: task.compute(*task.arguments))
+def load_task(task: Task, cache: Cache) -> Arrays:
+    """The result of a task: from the cache, or computed if it is missing or damaged there."""
+    return cache.get(task.kind, task.key, lambda: task.compute(*task.arguments))

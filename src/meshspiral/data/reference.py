@@ -1,4 +1,4 @@
-"""Geodesic distances on the template: what an error is measured with."""
+"""Geodesic distances on the template, with which errors are measured."""
 
 from __future__ import annotations
 
@@ -9,37 +9,52 @@ from importlib.metadata import version
 import numpy as np
 from tqdm import tqdm
 
-from meshspiral.data.cache import Store, code_version, digest
+from meshspiral.data.cache import Cache, code_version
 from meshspiral.geometry import geodesics, mesh
+from meshspiral.geometry.digest import digest
 from meshspiral.geometry.mesh import Mesh
 
-BLOCK = 256  # rows kept in one file
-IN_MEMORY = 2**30  # bytes of rows; all of them up to 16,000 vertices
+BLOCK = 256  # rows per cached file
+IN_MEMORY = 2**30  # bytes of rows held in memory; enough for all rows up to 16,000 vertices
 
 
 class ReferenceDistances:
-    """Distances between template vertices over sqrt(template area), computed as they are needed.
+    """Geodesic distances between template vertices over sqrt(template area), computed on demand.
 
-    Rows are computed in blocks of neighbouring vertex numbers and kept on disk and in memory.
-    diameter: the template's geodesic diameter, over sqrt(area) too, so that an error over the
-    diameter is an error over sqrt(area) divided by it. place: float64 [K, 3], the template's
-    vertices over sqrt(area). Between two components of the template
-    there is no path; such a distance counts as the diameter.
+    Rows are computed in blocks of consecutive vertices and cached on disk and in memory. There is
+    no path between two components of the template; such a distance counts as the diameter.
+
+    Args:
+        template: The template.
+        cache: Cache of the rows and the diameter.
+
+    Attributes:
+        diameter: Geodesic diameter of the template over sqrt(area). An error over sqrt(area),
+            divided by it, is the error over the diameter.
+        place: Template vertices over sqrt(area), float64 [K, 3].
     """
 
-    def __init__(self, template: Mesh, store: Store):
-        self.template, self._store = template, store
+    def __init__(self, template: Mesh, cache: Cache):
+        self.template, self._cache = template, cache
         self._blocks: dict[int, np.ndarray] = {}
         self._solver: geodesics.GeodesicSolver | None = None
         versions = code_version(geodesics, mesh, sys.modules[__name__]), version("potpourri3d")
         self._key = digest(template.vertices, template.faces, *versions)
         self._unit = np.sqrt(template.area)
         self.place = template.vertices / self._unit
-        kept = store.get("diameter", self._key, self._compute_diameter)
-        self.diameter = float(kept["diameter"])
+        cached = cache.get("diameter", self._key, self._compute_diameter)
+        self.diameter = float(cached["diameter"])
 
     def __call__(self, sources: np.ndarray, targets: np.ndarray) -> np.ndarray:
-        """float64 [K]: the distance from sources[k] to targets[k], both int64 [K]."""
+        """Distances between pairs of vertices.
+
+        Args:
+            sources: Template vertices, int64 [K].
+            targets: Template vertices, int64 [K].
+
+        Returns:
+            Distance from sources[k] to targets[k] over sqrt(area), float64 [K].
+        """
         distances = np.zeros(len(sources))
         apart = np.flatnonzero(sources != targets)
         blocks = sources[apart] // BLOCK
@@ -54,7 +69,7 @@ class ReferenceDistances:
     def _block(self, block: int) -> np.ndarray:
         if block not in self._blocks:
             key, compute = f"{self._key}-{block}", partial(self._compute, block)
-            rows = self._store.get("distances", key, compute)["distances"]
+            rows = self._cache.get("distances", key, compute)["distances"]
             if (len(self._blocks) + 1) * rows.nbytes > IN_MEMORY and self._blocks:
                 del self._blocks[next(iter(self._blocks))]
             self._blocks[block] = rows

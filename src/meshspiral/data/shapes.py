@@ -1,4 +1,4 @@
-"""What a data set gives: a template, named shapes with labels, and a split."""
+"""The base of data sets: a template, named shapes with labels, and a split."""
 
 from __future__ import annotations
 
@@ -6,22 +6,27 @@ import zipfile
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
+from meshspiral.data.settings import DataSettings
 from meshspiral.geometry.mesh import Mesh
 
 SPLITS = ("train", "val", "test")
 
 
 class DataError(ValueError):
-    """A data set that is missing or wrong; the message says what, where, and what would mend it."""
+    """A data set is missing or invalid. The message says what, where, and how to fix it."""
 
 
 class SurfacePoints(NamedTuple):
-    """Points on the template: corners int64 [V, 3], the vertices of a face, and weights float64
-    [V, 3], the barycentric coordinates in it."""
+    """Points on the template in barycentric coordinates.
+
+    Attributes:
+        corners: Vertices of the face of each point, int64 [V, 3].
+        weights: Barycentric coordinates in that face, float64 [V, 3].
+    """
 
     corners: np.ndarray
     weights: np.ndarray
@@ -29,12 +34,17 @@ class SurfacePoints(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Shape:
-    """One mesh with its ground truth.
+    """A mesh with its ground truth.
 
-    labels: int64 [V], for every vertex its counterpart, a vertex of the data set's template.
-    points: where on the template the counterpart lies exactly, if it lies within a face; the label
-    is then the nearest vertex. DataError is raised for a wrong count or a label outside the
-    template.
+    Args:
+        mesh: The mesh, with V vertices.
+        labels: Template vertex that corresponds to each vertex, int64 [V].
+        template_size: Number of vertices of the template.
+        points: Points of the template that correspond exactly, where they lie within faces; the
+            labels are then the nearest vertices. None if only labels are known.
+
+    Raises:
+        DataError: Labels or points have the wrong shape or name vertices outside the template.
     """
 
     mesh: Mesh
@@ -46,60 +56,95 @@ class Shape:
         labels = np.ascontiguousarray(self.labels, dtype=np.int64)
         vertices = len(self.mesh.vertices)
         if labels.shape != (vertices,):
-            raise DataError(f"{self.mesh.name}: {vertices} vertices but labels {labels.shape}")
-        self._within(labels, "labels")
+            raise DataError(
+                f"{self.mesh.name}: {vertices} vertices but labels {labels.shape}; "
+                f"labels must have shape ({vertices},)"
+            )
+        self._check_range(labels, "labels")
         object.__setattr__(self, "labels", labels)
         if self.points is not None:
             corners = np.ascontiguousarray(self.points.corners, dtype=np.int64)
             weights = np.ascontiguousarray(self.points.weights, dtype=np.float64)
             if corners.shape != (vertices, 3) or weights.shape != (vertices, 3):
                 raise DataError(
-                    f"{self.mesh.name}: {vertices} vertices but points on the template "
-                    f"{corners.shape}, {weights.shape}"
+                    f"{self.mesh.name}: {vertices} vertices but points on the template with "
+                    f"corners {corners.shape} and weights {weights.shape}; "
+                    f"both must have shape ({vertices}, 3)"
                 )
-            self._within(corners.min(axis=1), "points")
-            self._within(corners.max(axis=1), "points")
+            self._check_range(corners.min(axis=1), "points")
+            self._check_range(corners.max(axis=1), "points")
             object.__setattr__(self, "points", SurfacePoints(corners, weights))
 
-    def _within(self, vertices: np.ndarray, what: str) -> None:
+    def _check_range(self, vertices: np.ndarray, noun: str) -> None:
         bad = np.flatnonzero((vertices < 0) | (vertices >= self.template_size))
         if len(bad):
             raise DataError(
-                f"{self.mesh.name}: {len(bad)} {what} outside 0..{self.template_size - 1}, "
-                f"the template's vertices; first: vertex {bad[0]} has {vertices[bad[0]]}"
+                f"{self.mesh.name}: {len(bad)} {noun} outside 0..{self.template_size - 1}, "
+                f"the vertices of the template; first: vertex {bad[0]} has {vertices[bad[0]]}"
             )
 
     def renumbered(self, order: np.ndarray) -> Shape:
-        """The same shape with vertex order[i] at place i."""
+        """The shape with its vertices renumbered: new vertex i is old vertex order[i].
+
+        Args:
+            order: A permutation, int64 [V].
+        """
         points = self.points and SurfacePoints(*(array[order] for array in self.points))
         return Shape(self.mesh.renumbered(order), self.labels[order], self.template_size, points)
 
 
 class ShapeSet(ABC):
-    """A data set. Meshes are read when asked for, not before.
+    """A data set: a template, named shapes, and a split. Meshes are read when asked for.
 
-    template: the reference mesh whose vertices are the labels and on which errors are measured.
-    names: for each of "train", "val" and "test" the names of its shapes, in a fixed order.
-    up: the axis, "y" or "z", that points up; only pictures ask for it.
+    A subclass registers under a name, `class Bodies(ShapeSet, name="bodies")`. The fields that its
+    `Settings` adds to `DataSettings` are the arguments of its constructor.
+
+    Attributes:
+        registered: All data sets, by name.
+        template: The reference mesh: labels are its vertices, and errors are measured on it.
+        names: For each of "train", "val" and "test" the names of its shapes, in a fixed order.
+        up: The axis that points up in pictures, "y" or "z".
     """
 
+    registered: ClassVar[dict[str, type[ShapeSet]]] = {}
+    Settings: ClassVar[type[DataSettings]] = DataSettings
     template: Mesh
     names: dict[str, list[str]]
     up = "y"
 
-    def prepare(self, names: list[str]) -> None:  # noqa: B027
-        """Compute what `load` needs for those shapes, if it needs any such thing."""
+    def __init_subclass__(cls, name: str | None = None, **options: Any) -> None:
+        super().__init_subclass__(**options)
+        if name is not None:
+            ShapeSet.registered[name] = cls
+
+    def prepare(self, names: list[str]) -> None:  # noqa: B027  (an optional hook)
+        """Compute what `load` needs for these shapes, if anything."""
 
     @abstractmethod
     def load(self, name: str) -> Shape:
-        """The shape of that name. Errors: MeshError, DataError."""
+        """Load a shape.
+
+        Args:
+            name: One of `names`.
+
+        Raises:
+            DataError: There is no such shape, or its data are unusable.
+            MeshError: Its mesh is unusable.
+        """
 
 
 def subject_split(names: list[str], per_subject: int = 10) -> dict[str, list[str]]:
-    """The paper's 70/10/20 split of 100 shapes in FAUST's order.
+    """The 70/10/20 split of Lim et al. 2018 for 100 shapes in FAUST's order.
 
-    Shape i shows subject i // 10 in pose i % 10; subjects 0-6 train, 7 validates, 8 and 9 test, so
-    that validation and test show people never seen in training.
+    Shape i shows subject i // 10 in pose i % 10. Subjects 0-6 train, 7 validates, 8 and 9 test, so
+    validation and test show subjects that are not in training.
+
+    Args:
+        names: Names of the shapes, in this order.
+        per_subject: Number of poses per subject.
+
+    Returns:
+        The names of "train", "val" and "test".
     """
     subjects = [names[i : i + per_subject] for i in range(0, len(names), per_subject)]
     groups = {"train": subjects[:7], "val": subjects[7:8], "test": subjects[8:]}
@@ -107,29 +152,37 @@ def subject_split(names: list[str], per_subject: int = 10) -> dict[str, list[str
 
 
 def registered_shape(mesh: Mesh, template: Mesh) -> Shape:
-    """The shape of a mesh numbered like the template: its labels are its vertex numbers.
+    """The shape of a mesh in the template's vertex order: vertex i has label i.
 
-    Errors: DataError where the two have different numbers of vertices.
+    Raises:
+        DataError: Mesh and template have different numbers of vertices.
     """
     size = len(template.vertices)
     if len(mesh.vertices) != size:
         raise DataError(
             f"{mesh.name}: {len(mesh.vertices)} vertices, but the template {template.name} has "
-            f"{size}; a registered mesh has the template's vertices in the template's order"
+            f"{size}; a registered mesh must have the template's vertices in the template's order"
         )
     return Shape(mesh, np.arange(size), size)
 
 
 def read_labels(path: str | Path, vertices: int | None = None) -> np.ndarray:
-    """The labels of one mesh, int64 [V]: for every vertex in its order a vertex of the template.
+    """Read the labels of a mesh.
 
-    path: a text file with one whole number a line, or a `.npy` of integers [V]. vertices: the V
-    to insist on. Errors: DataError, with the path, for a file that is missing or holds anything
-    else, or another V. The range is not checked here but by `Shape`, which knows the template.
+    Args:
+        path: A text file with one integer per line, or a `.npy` file with integers [V].
+        vertices: Number of labels V that the file must have; None for any.
+
+    Returns:
+        Template vertex that corresponds to each vertex, int64 [V]. The range is not checked here
+        but by `Shape`, which knows the template.
+
+    Raises:
+        DataError: The file is missing, holds anything else, or has another number of labels.
     """
     path = Path(path)
     try:
-        labels = _array(path) if path.suffix == ".npy" else _column(path)
+        labels = _read_npy(path) if path.suffix == ".npy" else _read_lines(path)
     except OSError as error:
         raise DataError(f"{path}: cannot read the labels ({error.strerror or error})") from error
     if vertices is not None and len(labels) != vertices:
@@ -137,18 +190,18 @@ def read_labels(path: str | Path, vertices: int | None = None) -> np.ndarray:
     return labels
 
 
-def _array(path: Path) -> np.ndarray:
+def _read_npy(path: Path) -> np.ndarray:
     try:
         labels = np.load(path, allow_pickle=False)
     except (ValueError, EOFError, zipfile.BadZipFile) as error:
         raise DataError(f"{path}: not a readable .npy file ({error})") from error
-    kind = getattr(labels, "dtype", None), getattr(labels, "shape", None)
-    if kind[0] is None or kind[0].kind not in "iu" or len(kind[1]) != 1:
-        raise DataError(f"{path}: labels must be integers [V], got {kind[0]} {kind[1]}")
+    dtype, shape = getattr(labels, "dtype", None), getattr(labels, "shape", None)
+    if dtype is None or dtype.kind not in "iu" or len(shape) != 1:
+        raise DataError(f"{path}: labels must be integers [V], got {dtype} {shape}")
     return labels.astype(np.int64)
 
 
-def _column(path: Path) -> np.ndarray:
+def _read_lines(path: Path) -> np.ndarray:
     lines = path.read_text(encoding="utf-8-sig", errors="replace").rstrip().splitlines()
     labels = np.empty(len(lines), dtype=np.int64)
     for i, line in enumerate(lines):
@@ -156,6 +209,6 @@ def _column(path: Path) -> np.ndarray:
             labels[i] = int(line)
         except (ValueError, OverflowError) as error:
             raise DataError(
-                f"{path}: line {i + 1} is {line[:40]!r}, not the number of a template vertex"
+                f"{path}: line {i + 1} must be the index of a template vertex, got {line[:40]!r}"
             ) from error
     return labels

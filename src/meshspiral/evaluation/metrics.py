@@ -1,8 +1,8 @@
-"""Errors of a correspondence, and the curve of Kim et al. 2011.
+"""Geodesic errors of a correspondence, and their cumulative curve (Kim et al. 2011).
 
-Every error here is a geodesic distance on the template between the predicted vertex and the true
-one, over the square root of the template's area. Over the geodesic diameter it is the same number
-divided by the diameter; the literature has both, so names say which.
+An error is the geodesic distance on the template between the predicted and the true vertex, divided
+by the square root of the template's area. The literature also divides by the geodesic diameter;
+metric names say which of the two is meant.
 """
 
 from __future__ import annotations
@@ -13,7 +13,9 @@ import numpy as np
 import torch
 from torchmetrics import Metric
 
-THRESHOLDS = np.arange(201) / 1000  # of sqrt(area): 0 to 0.2, as in the paper's figures
+from meshspiral.geometry.barycentric import interpolate
+
+THRESHOLDS = np.arange(201) / 1000  # of sqrt(area); 0 to 0.2, the range that Lim et al. 2018 plot
 REPORTED = (0.01, 0.05, 0.10)
 
 
@@ -22,10 +24,16 @@ def geodesic_errors(
     labels: np.ndarray,
     distances: Callable[[np.ndarray, np.ndarray], np.ndarray],
 ) -> np.ndarray:
-    """float64 [V]: how far from the right vertex of the template the predicted one is.
+    """Geodesic distance of each predicted vertex from the label.
 
-    predicted, labels: int64 [V], vertices of the template. distances: from sources [K] to targets
-    [K], for instance `ReferenceDistances`.
+    Args:
+        predicted: Template vertices, int64 [V].
+        labels: Template vertices, int64 [V].
+        distances: Maps sources [K] and targets [K] to their distances [K], e.g.
+            `ReferenceDistances`.
+
+    Returns:
+        float64 [V], in the unit of `distances`.
     """
     return distances(labels, predicted)
 
@@ -35,28 +43,42 @@ def point_errors(
     corners: np.ndarray,
     weights: np.ndarray,
     distances: Callable[[np.ndarray, np.ndarray], np.ndarray],
-    place: np.ndarray,
+    vertices: np.ndarray,
 ) -> np.ndarray:
-    """float64 [V]: how far the predicted vertex is from a point within a face of the template.
+    """Geodesic distance of each predicted vertex from a point within a face of the template.
 
-    predicted: int64 [V]. corners: int64 [V, 3] and weights: float [V, 3], the point. distances: as
-    above. place: float [K, 3], the template's vertices in the unit of the distances. From a corner
-    of the face it is a straight line; else the corners' distances, interpolated linearly.
+    If the predicted vertex is a corner of that face, this is the straight distance; otherwise it is
+    interpolated linearly from the distances of the corners.
+
+    Args:
+        predicted: Template vertices, int64 [V].
+        corners: Corners of the face of each point, int64 [V, 3].
+        weights: Barycentric coordinates of each point, float [V, 3].
+        distances: As for `geodesic_errors`.
+        vertices: Positions of the template's vertices in the unit of `distances`, float [K, 3].
+
+    Returns:
+        float64 [V], in the unit of `distances`.
     """
     error = np.zeros(len(predicted))
     for corner, weight in zip(corners.T, weights.T, strict=True):
         error += weight * distances(corner, predicted)
     within = (corners == predicted[:, None]).any(axis=1)
-    point = np.einsum("vk,vkx->vx", weights[within], place[corners[within]])
-    error[within] = np.linalg.norm(point - place[predicted[within]], axis=1)
+    point = interpolate(vertices, corners[within], weights[within])
+    error[within] = np.linalg.norm(point - vertices[predicted[within]], axis=1)
     return error
 
 
 def correspondence_curve(errors: np.ndarray, thresholds: np.ndarray = THRESHOLDS) -> np.ndarray:
-    """float64 [T]: the share of errors that are at most each threshold (Kim et al. 2011).
+    """The share of errors up to each threshold (Kim et al. 2011).
 
-    errors: [V]. thresholds: [T], ascending, inclusive: the value at 0 is the exact-match rate.
-    NaN where there are no errors at all.
+    Args:
+        errors: float [V].
+        thresholds: float [T], ascending. They are inclusive: the value at 0 is the exact-match
+            rate.
+
+    Returns:
+        float64 [T]; NaN if there are no errors.
     """
     if len(errors) == 0:
         return np.full(len(thresholds), np.nan)
@@ -64,15 +86,15 @@ def correspondence_curve(errors: np.ndarray, thresholds: np.ndarray = THRESHOLDS
 
 
 def _counts(errors: np.ndarray, thresholds: np.ndarray) -> np.ndarray:
-    """int64 [T]: how many errors are at most each threshold."""
+    """The number of errors up to each threshold, int64 [T]."""
     return np.searchsorted(np.sort(errors), thresholds, side="right")
 
 
 class CorrespondenceError(Metric):
-    """The errors of whole meshes, pooled over all vertices of all of them.
+    """Mean error, exact-match rate and curve, pooled over all vertices of all meshes.
 
-    compute() gives a dictionary of scalars: exact_match, geodesic_error (the mean),
-    within_0.01, within_0.05, within_0.10; and `curve`, [T] over THRESHOLDS.
+    `compute` returns the scalars `exact_match`, `geodesic_error` (the mean), `within_0.01`,
+    `within_0.05` and `within_0.10` (shares of vertices), and `curve`, float64 [T] over THRESHOLDS.
     """
 
     full_state_update = False
@@ -85,7 +107,12 @@ class CorrespondenceError(Metric):
         self.add_state("within", counts, dist_reduce_fx="sum")
 
     def update(self, errors: np.ndarray, exact: np.ndarray) -> None:
-        """errors: float [V], over sqrt(area). exact: bool [V], the right vertex was hit."""
+        """Add the vertices of a mesh.
+
+        Args:
+            errors: Errors over sqrt(area), float [V].
+            exact: Whether the predicted vertex is the label, bool [V].
+        """
         self.vertices += len(errors)
         self.exact += int(exact.sum())
         self.error += float(errors.sum())

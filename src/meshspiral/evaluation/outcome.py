@@ -1,4 +1,4 @@
-"""What a network makes of the test shapes: predictions and errors, and the file that keeps them."""
+"""The outcome of a test: predictions and errors of all vertices, and the file that holds them."""
 
 from __future__ import annotations
 
@@ -9,16 +9,21 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from meshspiral.data.datamodule import Batch
+from meshspiral.data.files import write_arrays
 from meshspiral.data.reference import ReferenceDistances
 from meshspiral.evaluation.metrics import CorrespondenceError, geodesic_errors, point_errors
-from meshspiral.experiment.runs import RunError, write_arrays
-
-ERRORS = "errors.npz"
+from meshspiral.evaluation.run_folder import RunError
+from meshspiral.neighbourhoods.base import Batch
 
 
 class Result(NamedTuple):
-    """One mesh: predicted int64 [V], errors float64 [V] to the true point, and to the label."""
+    """Predictions and errors of one mesh.
+
+    Attributes:
+        predicted: Template vertices, int64 [V].
+        errors: Distance from the true point over sqrt(area), float64 [V].
+        label_errors: Distance from the label over sqrt(area), float64 [V].
+    """
 
     predicted: np.ndarray
     errors: np.ndarray
@@ -26,7 +31,13 @@ class Result(NamedTuple):
 
 
 def result_of(predicted: np.ndarray, batch: Batch, distances: ReferenceDistances) -> Result:
-    """The errors of a prediction, int64 [V], of a mesh of `MeshDataset`; over sqrt(area)."""
+    """Compute the errors of a prediction.
+
+    Args:
+        predicted: Template vertices, int64 [V].
+        batch: The mesh, an item of `MeshDataset`.
+        distances: Distances on the template.
+    """
     to_label = geodesic_errors(predicted, batch["labels"].cpu().numpy(), distances)
     if "corners" not in batch:
         return Result(predicted, to_label, to_label)
@@ -36,13 +47,17 @@ def result_of(predicted: np.ndarray, batch: Batch, distances: ReferenceDistances
 
 @dataclass(frozen=True, eq=False)
 class Outcome:
-    """A test, as errors.npz keeps it.
+    """Predictions and errors on M meshes, as saved in errors.npz. K is the sum of all V.
 
-    names: of the M meshes. first: int64 [M+1]; mesh m has the entries first[m]:first[m+1] of
-    predicted and labels, int32 [sum V], vertices of the template, and of errors and label_errors,
-    float32 [sum V]: the geodesic distance on the template from the predicted vertex to the true
-    point and to the label, over the square root of the template's area. diameter: the template's
-    geodesic diameter in the same unit.
+    Attributes:
+        names: Names of the meshes; M entries.
+        first: int64 [M + 1]; mesh m has the entries first[m]:first[m + 1] of the arrays below.
+        predicted: Predicted template vertices, int32 [K].
+        labels: Labels, int32 [K].
+        errors: Geodesic distance on the template from the predicted vertex to the true point, over
+            the square root of the template's area, float32 [K].
+        label_errors: The same distance to the label, float32 [K].
+        diameter: Geodesic diameter of the template over the square root of its area.
     """
 
     names: list[str]
@@ -57,7 +72,14 @@ class Outcome:
     def of(
         cls, names: list[str], items: list[Batch], results: Mapping[int, Result], diameter: float
     ) -> Outcome:
-        """Of the meshes that were tested, by their number in names and items."""
+        """The outcome of the meshes that have a result.
+
+        Args:
+            names: Names of all meshes.
+            items: Items of `MeshDataset` of all meshes.
+            results: Results by index into `names` and `items`.
+            diameter: Geodesic diameter of the template over the square root of its area.
+        """
         chosen = sorted(results)
         columns = [
             np.concatenate(column) for column in zip(*(results[i] for i in chosen), strict=True)
@@ -75,28 +97,39 @@ class Outcome:
         )
 
     def mesh(self, name: str) -> slice:
-        """The entries of the mesh of that name."""
+        """The entries of a mesh, by its name."""
         i = self.names.index(name)
         return slice(int(self.first[i]), int(self.first[i + 1]))
 
-    def figures(self) -> tuple[dict[str, float], np.ndarray]:
-        """The figures of metrics.json, without their "test/", and the curve over THRESHOLDS."""
+    def metrics(self) -> tuple[dict[str, float], np.ndarray]:
+        """Pool all vertices.
+
+        Returns:
+            The metrics of metrics.json, without their prefix "test/"; and the curve, float64 [T]
+            over THRESHOLDS. `geodesic_error_to_label` is only given where true points lie within
+            faces.
+        """
         pooled = CorrespondenceError()
         pooled.update(self.errors, self.predicted == self.labels)
         values = pooled.compute()
         curve = values.pop("curve").numpy()
-        figures = {name: float(value) for name, value in values.items()}
-        figures["geodesic_error_diameter"] = figures["geodesic_error"] / self.diameter
+        metrics = {name: float(value) for name, value in values.items()}
+        metrics["geodesic_error_diameter"] = metrics["geodesic_error"] / self.diameter
         if not np.array_equal(self.errors, self.label_errors):
-            figures["geodesic_error_to_label"] = float(self.label_errors.mean(dtype=np.float64))
-        return figures, curve
+            metrics["geodesic_error_to_label"] = float(self.label_errors.mean(dtype=np.float64))
+        return metrics, curve
 
     def save(self, path: Path) -> None:
+        """Write the file."""
         write_arrays(path, **{f.name: np.asarray(getattr(self, f.name)) for f in fields(self)})
 
     @classmethod
     def load(cls, path: Path) -> Outcome:
-        """Errors: RunError for a file that is not there, or not whole, or not one of these."""
+        """Read a file that `save` wrote.
+
+        Raises:
+            RunError: The file does not exist, is damaged, or is of another kind.
+        """
         try:
             with np.load(path, allow_pickle=False) as file:
                 arrays = {f.name: file[f.name] for f in fields(cls)}
@@ -106,17 +139,20 @@ class Outcome:
             if len(first) != len(names) + 1 or lengths != {int(first[-1])}:
                 raise ValueError("its arrays have different lengths")
         except FileNotFoundError:
-            raise RunError(f"{path} is not there") from None
-        except Exception as error:  # whatever a damaged file makes numpy say
+            raise RunError(f"{path} does not exist") from None
+        except Exception as error:  # NumPy raises many types for damaged files
             raise RunError(f"{path} is damaged ({str(error)[:100]})") from error
         return cls(names, diameter=diameter, **arrays)
 
 
 class Rotations(NamedTuple):
-    """The same test with other spirals each time.
+    """Results of R repetitions of a test, each with other random spirals.
 
-    curves: float64 [R, T] over THRESHOLDS. exact_match, geodesic_error: float64 [R].
-    unchanged: the share of vertices that got one prediction in all R.
+    Attributes:
+        curves: float64 [R, T] over THRESHOLDS.
+        exact_match: Exact-match rates, float64 [R].
+        geodesic_error: Mean errors over sqrt(area), float64 [R].
+        unchanged: Share of vertices whose prediction is the same in all repetitions.
     """
 
     curves: np.ndarray
@@ -124,22 +160,28 @@ class Rotations(NamedTuple):
     geodesic_error: np.ndarray
     unchanged: float
 
-    def figures(self) -> dict[str, float]:
-        found: dict[str, float] = {"unchanged": self.unchanged, "runs": len(self.curves)}
+    def metrics(self) -> dict[str, float]:
+        """Mean, standard deviation, minimum and maximum over the repetitions, for metrics.json."""
+        metrics: dict[str, float] = {"unchanged": self.unchanged, "runs": len(self.curves)}
         for name in ("exact_match", "geodesic_error"):
             values = getattr(self, name)
-            told = {
+            statistics = {
                 "mean": values.mean(),
                 "spread": values.std(),
                 "least": values.min(),
                 "most": values.max(),
             }
-            found |= {f"{name}/{what}": float(value) for what, value in told.items()}
-        return found
+            metrics |= {f"{name}/{key}": float(value) for key, value in statistics.items()}
+        return metrics
 
 
 def rotations(runs: Iterable[list[Result]], labels: list[np.ndarray]) -> Rotations:
-    """Pools runs, each of all meshes. labels: int64 [V] of each mesh."""
+    """Pool repetitions of a test.
+
+    Args:
+        runs: For each repetition, the results of all meshes.
+        labels: Labels of each mesh, int64 [V].
+    """
     curves, exact, errors, first, same = [], [], [], None, None
     for run in runs:
         pooled = CorrespondenceError()
@@ -156,11 +198,11 @@ def rotations(runs: Iterable[list[Result]], labels: list[np.ndarray]) -> Rotatio
 
 
 def evenly(names: list[str], count: int) -> list[str]:
-    """So many of the names, or all, evenly spread: bodies in FAUST's order show other poses."""
-    places = np.linspace(0, len(names) - 1, min(count, len(names)))
-    return [names[i] for i in np.unique(places.round().astype(int))]
+    """Choose at most `count` names, evenly spread: in FAUST's order they then differ in pose."""
+    indices = np.linspace(0, len(names) - 1, min(count, len(names)))
+    return [names[i] for i in np.unique(indices.round().astype(int))]
 
 
-def json_ready(figures: Mapping[str, Any], prefix: str) -> dict[str, Any]:
-    """Flat names for metrics.json."""
-    return {f"{prefix}/{name}": value for name, value in figures.items()}
+def json_ready(metrics: Mapping[str, Any], prefix: str) -> dict[str, Any]:
+    """The metrics with the prefix that they have in metrics.json, e.g. "test"."""
+    return {f"{prefix}/{name}": value for name, value in metrics.items()}

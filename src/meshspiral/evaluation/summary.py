@@ -1,4 +1,4 @@
-"""What a test shows: a table of its figures, curves, pictures."""
+"""The summary of a test: its metrics as text, curves and renders."""
 
 from __future__ import annotations
 
@@ -10,23 +10,23 @@ import numpy as np
 from tqdm import tqdm
 
 from meshspiral.data.datamodule import CorrespondenceData
+from meshspiral.data.files import write_file
 from meshspiral.evaluation.metrics import THRESHOLDS
 from meshspiral.evaluation.outcome import Outcome
-from meshspiral.experiment.runs import write_whole
-from meshspiral.viz.plots import (
-    curve_figure,
-    encoded,
-    error_colors,
-    picture_figure,
-    template_colors,
-)
+from meshspiral.viz.colors import error_colors, template_colors
+from meshspiral.viz.plots import curve_figure, encoded, picture_figure
 from meshspiral.viz.render import RenderError, Row, render
 
 log = logging.getLogger(__name__)
 
 
-def table(outcome: Outcome, metrics: Mapping[str, float]) -> list[str]:
-    """The test figures of metrics.json, in lines."""
+def metric_lines(outcome: Outcome, metrics: Mapping[str, float]) -> list[str]:
+    """The test metrics as lines of text.
+
+    Args:
+        outcome: Of the test.
+        metrics: The content of metrics.json.
+    """
     names = outcome.names
     shares = {"exact match": "exact_match"}
     shares |= {f"within {r} sqrt(area)": f"within_{r}" for r in ("0.01", "0.05", "0.10")}
@@ -37,12 +37,12 @@ def table(outcome: Outcome, metrics: Mapping[str, float]) -> list[str]:
     return [
         f"Test on {len(names)} unseen meshes ({names[0]} .. {names[-1]}), "
         f"{len(outcome.labels):,} vertices",
-        *(f"  {what:<34} {100 * metrics['test/' + key]:7.2f} %" for what, key in shares.items()),
-        *(f"  {what:<34} {metrics['test/' + key]:9.4f}" for what, key in errors.items()),
+        *(f"  {title:<34} {100 * metrics['test/' + key]:7.2f} %" for title, key in shares.items()),
+        *(f"  {title:<34} {metrics['test/' + key]:9.4f}" for title, key in errors.items()),
     ]
 
 
-def draw(
+def write_plots(
     folder: Path,
     curves: Mapping[str, np.ndarray],
     outcome: Outcome,
@@ -50,32 +50,40 @@ def draw(
     chosen: list[str],
     kinds: tuple[str, ...] = ("png",),
 ) -> None:
-    """Write curve.<kind> and, for the chosen test shapes, correspondence.png and errors.png.
+    """Write curve.<kind>, and renders of test shapes: correspondence.png and errors.png.
 
-    curves: by name, over THRESHOLDS. Without an OpenGL library a warning takes the renders' place.
+    Without an OpenGL library, a warning says that the renders are skipped.
+
+    Args:
+        folder: Where to write them.
+        curves: By name, the shares of correct matches over THRESHOLDS.
+        outcome: Of the test.
+        data: The data set, with the test split prepared.
+        chosen: Names of the test shapes to render; none for no renders.
+        kinds: File formats of the curves: "png", "pdf", "svg".
     """
     figure = curve_figure({name: (THRESHOLDS, curve) for name, curve in curves.items()})
     for kind in kinds:
-        write_whole(folder / f"curve.{kind}", encoded(figure, kind))
+        write_file(folder / f"curve.{kind}", encoded(figure, kind))
     if not chosen:
         return
     rows = [correspondence_row(outcome, data, chosen), error_row(outcome, data, chosen)]
     try:
-        with tqdm(total=1, desc="Pictures", leave=False, delay=1.0):
-            drawn = render(rows, data.shapes.up)
+        with tqdm(total=1, desc="Rendering", leave=False, delay=1.0):
+            correspondence, errors = render(rows, data.shapes.up)
     except RenderError as error:
-        log.warning("no pictures of the shapes: %s", error)
+        log.warning("skipping renders: %s", error)
         return
     figures = {
-        "correspondence.png": picture_figure(*drawn[0], ["template", *chosen]),
-        "errors.png": picture_figure(*drawn[1], chosen, bar="error"),
+        "correspondence": picture_figure(*correspondence, ["template", *chosen]),
+        "errors": picture_figure(*errors, chosen, bar="error"),
     }
     for name, picture in figures.items():
-        write_whole(folder / name, encoded(picture, "png"))
+        write_file(folder / f"{name}.png", encoded(picture, "png"))
 
 
 def correspondence_row(outcome: Outcome, data: CorrespondenceData, chosen: list[str]) -> Row:
-    """The template and test shapes, each vertex in the colour of its counterpart."""
+    """The template and test shapes, each vertex in the colour of its predicted counterpart."""
     template = data.shapes.template
     colors = template_colors(template)
     meshes = [template, *(data.shape(name).mesh for name in chosen)]

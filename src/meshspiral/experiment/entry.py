@@ -1,4 +1,4 @@
-"""What all entry points share: a config from Hydra, and one clear message for each mistake."""
+"""The entry point of all commands: a config from Hydra, and one message for each mistake."""
 
 from __future__ import annotations
 
@@ -10,23 +10,26 @@ import sys
 import traceback
 from collections.abc import Callable
 from pathlib import Path
+from typing import TypeVar
 
 import hydra
 from hydra.core.hydra_config import HydraConfig
 from hydra.errors import HydraException
 from hydra.types import RunMode
-from omegaconf import DictConfig
+from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
+from pydantic import BaseModel
 
+from meshspiral.data.files import write_file
 from meshspiral.data.shapes import DataError
-from meshspiral.experiment.runs import RunError, Stopped, write_whole
-from meshspiral.experiment.schema import ConfigError
-from meshspiral.experiment.sweeps import Table, announce, note_failure
+from meshspiral.evaluation.run_folder import RunError
+from meshspiral.experiment.compose import CONF
+from meshspiral.experiment.help import settings_help
+from meshspiral.experiment.schema import MOVED, ConfigError, read_config
+from meshspiral.experiment.sweeps import invocation, note_failure, number_failed, show_table
 from meshspiral.geometry.mesh import MeshError
+from meshspiral.training.stopping import Stopped
 
-PACKAGE = Path(__file__).parents[1]
-# in a clone conf/ is at its root; an installed package brings a copy
-CONF = str(next(p for p in (PACKAGE.parents[1] / "conf", PACKAGE / "conf") if p.is_dir()))
 USER_ERRORS = (
     ConfigError,
     DataError,
@@ -38,81 +41,96 @@ USER_ERRORS = (
 )
 
 log = logging.getLogger(__name__)
+Config = TypeVar("Config", bound=BaseModel)
 
 
 def entry_point(
-    name: str, check: Callable[[DictConfig], DictConfig]
-) -> Callable[[Callable[[DictConfig], None]], Callable[[], None]]:
-    """Make `task(check(config))` a program with the config conf/<name>.yaml.
+    name: str, schema: type[Config]
+) -> Callable[[Callable[[Config], None]], Callable[[], None]]:
+    """Make a function of a config a program, with the composed config of conf/<name>.yaml.
 
-    A mistake of the user ends it with one message and exit code 1 (2 if the command line can't be
-    read), Ctrl-C with 130 and SIGTERM with 143. Anything else is an error of ours and shows its
-    traceback. In a sweep the jobs after a failed one still run.
+    A mistake of the user ends the program with one message and exit code 1, or 2 if the command
+    line cannot be parsed; Ctrl-C with 130 and SIGTERM with 143. Any other exception is a bug and
+    shows its traceback. A failed job of a sweep does not stop the other jobs.
+
+    Args:
+        name: Name of the command.
+        schema: The type of the config.
     """
 
-    def decorate(task: Callable[[DictConfig], None]) -> Callable[[], None]:
-        failed: list[str] = []
-
-        def job(config: DictConfig) -> None:
-            hydra_ = HydraConfig.get()
-            folder = Path(hydra_.runtime.output_dir) if hydra_.mode == RunMode.MULTIRUN else None
-            if folder:
-                note_failure(folder, None)
-            try:
-                task(check(config))
-                return
-            except USER_ERRORS as error:
-                reason = one_line(error)
-                log.error("error: %s", reason)
-            except Exception as error:
-                reason = repr(error)
-                log.exception("error: this should not have happened")
-            failed.append(reason)
-            if folder:
-                note_failure(folder, reason)
-
+    def decorate(task: Callable[[Config], None]) -> Callable[[], None]:
         def main() -> None:
-            failed.clear()
-            os.environ.setdefault("HYDRA_FULL_ERROR", "1")  # Hydra hands errors on: we word them
-            announce()
+            failed: list[str] = []
+            os.environ.setdefault("HYDRA_FULL_ERROR", "1")  # Hydra raises errors; we word them
             signal.signal(signal.SIGTERM, _stop)
             signal.signal(signal.SIGINT, _stop)
-            try:
-                hydra.main(config_path=CONF, config_name=name, version_base="1.3")(job)()
-            except Stopped as stopped:
-                print(f"\n{stopped}", file=sys.stderr)
-                sys.exit(128 + stopped.signum)
-            except USER_ERRORS as error:
-                print(f"error: {one_line(error)}", file=sys.stderr)
-                sys.exit(2 if isinstance(error, HydraException) else 1)
-            except Exception as error:  # of the launcher: a job that was killed, say
-                if Table.folder is None:
-                    raise
-                Table.show()
-                reason = f"{type(error).__name__}: {' '.join(str(error).split())}"
-                where = Table.folder / "traceback.txt"
-                write_whole(where, traceback.format_exc())
-                print(
-                    f"error: a job came to no end ({reason}; traceback in {where}); "
-                    "to go on: the same command",
-                    file=sys.stderr,
-                )
-                sys.exit(1)
-            if failed or Table.failed:
-                sys.exit(1)
+            with invocation(sys.argv[1:]) as call:
+                try:
+
+                    def job(config: DictConfig) -> None:
+                        _run_job(task, schema, failed, config)
+
+                    hydra.main(config_path=CONF, config_name=name, version_base="1.3")(job)()
+                except Stopped as stopped:
+                    again = " To resume: rerun the same command" if call.sweep else ""
+                    print(f"\n{stopped}{again}", file=sys.stderr)
+                    sys.exit(128 + stopped.signum)
+                except USER_ERRORS as error:
+                    print(f"error: {one_line(error)}", file=sys.stderr)
+                    sys.exit(2 if isinstance(error, HydraException) else 1)
+                except Exception as error:
+                    if "Config group override" in str(error):  # Hydra's, for model=null
+                        print(f"error: {error}", file=sys.stderr)
+                        sys.exit(2)
+                    if call.sweep is None:
+                        raise
+                    # of the launcher, e.g. because a job was killed
+                    show_table(call.sweep)
+                    reason = f"{type(error).__name__}: {' '.join(str(error).split())}"
+                    where = call.sweep / "traceback.txt"
+                    write_file(where, traceback.format_exc())
+                    print(
+                        f"error: a job crashed ({reason}; traceback in {where}); "
+                        "rerun the same command to resume",
+                        file=sys.stderr,
+                    )
+                    sys.exit(1)
+                if failed or (call.sweep and number_failed(call.sweep)):
+                    sys.exit(1)
 
         return main
 
     return decorate
 
 
+def _run_job(
+    task: Callable[[Config], None], schema: type[Config], failed: list[str], config: DictConfig
+) -> None:
+    """Run a command with one config: the only one, or a job of a sweep."""
+    hydra_ = HydraConfig.get()
+    folder = Path(hydra_.runtime.output_dir) if hydra_.mode == RunMode.MULTIRUN else None
+    if folder:
+        note_failure(folder, None)
+    try:
+        task(read_config(schema, config))
+        return
+    except USER_ERRORS as error:
+        reason = one_line(error)
+        log.error("error: %s", reason)
+    except Exception as error:
+        reason = repr(error)
+        log.exception("error: unexpected exception, please report it")
+    failed.append(reason)
+    if folder:
+        note_failure(folder, reason)
+
+
 def _stop(signum: int, frame: object) -> None:
-    again = " To go on: the same command" if Table.folder else ""
-    raise Stopped(signum, f"Stopped.{again}")
+    raise Stopped(signum)
 
 
 def one_line(error: BaseException) -> str:
-    """An error in one line, for Hydra's and the operating system's errors too."""
+    """An error in one line, also one of Hydra or of the operating system."""
     if isinstance(error, HydraException | OmegaConfBaseException):
         lines = [line.strip() for line in str(error).splitlines() if line.strip()]
         for i, line in enumerate(lines):
@@ -124,9 +142,17 @@ def one_line(error: BaseException) -> str:
         if lines[0].startswith(("mismatched input", "token recognition", "no viable")):
             hint = "; a value with = or spaces needs quotes of its own: \"source='a b=c.ply'\""
             return lines[0] + hint
+        for old, new in MOVED.items():
+            if f"'{old}" in lines[0]:
+                return f"{lines[0]} {old} is {new} now"
         cause = error.__cause__
         reason = f" ({str(cause).splitlines()[0]})" if cause is not None and str(cause) else ""
         return lines[0] + reason
     if type(error).__module__ == "builtins" and isinstance(error, OSError) and error.filename:
         return f"{error.filename}: {error.strerror}"
     return str(error)
+
+
+OmegaConf.register_new_resolver(
+    "settings_help", lambda command: settings_help(command, Path(CONF)), replace=True
+)

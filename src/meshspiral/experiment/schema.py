@@ -1,281 +1,456 @@
-"""What a user may set, with types; and what is said of a mistake."""
+"""The settings of all commands: their types, ranges, choices and help texts.
+
+Default values stand in conf/, and nowhere else. A network, a neighbourhood and a data set declare
+their own settings, in their class's `Settings`.
+"""
 
 from __future__ import annotations
 
+import copy
 import difflib
-import math
-from dataclasses import dataclass, field, fields
-from typing import Any
+import importlib
+import inspect
+import os
+import sys
+import typing
+from typing import Annotated, Any, Literal, Self, TypeVar
 
-from omegaconf import MISSING, DictConfig, ListConfig, OmegaConf
-from omegaconf.errors import OmegaConfBaseException
+from omegaconf import DictConfig, OmegaConf
+from pydantic import (
+    BaseModel,
+    BeforeValidator,
+    Field,
+    SerializeAsAny,
+    ValidationError,
+    field_validator,
+    model_validator,
+)
+
+import meshspiral.data.datasets  # noqa: F401  registers the data sets
+from meshspiral.data.settings import DataSettings, Text
+from meshspiral.data.shapes import ShapeSet
+from meshspiral.neighbourhoods import Neighbourhood
+from meshspiral.nn.networks import Network
 
 
 class ConfigError(ValueError):
-    """A setting that can't be; the message names the key, the rule and the value."""
+    """A setting that cannot be used; the message names the key, the rule and the value."""
 
 
-@dataclass
-class Model:
-    name: str = MISSING
-    channels: list[int] = MISSING
-    dropout: float = 0.3
-    feature_scale: float = 1.0
+C = TypeVar("C", bound=BaseModel)
 
 
-@dataclass
-class FCS(Model):
-    metric: bool = False
-    metric_layers: str = "all"
+class Settings(BaseModel, extra="forbid", strict=True, frozen=True):
+    """Settings that accept their declared types alone, and no other keys."""
 
 
-@dataclass
-class LSTM(FCS):
-    rings: int | None = None
+Plugins = Annotated[
+    list[str],
+    Field(description="modules to import, which register networks, neighbourhoods or data sets"),
+]
+Accelerator = Annotated[Literal["cpu", "gpu"], Field(description="cpu or gpu")]
+Threads = Annotated[int | None, Field(ge=1, description="threads; null: one per core")]
 
 
-@dataclass
-class Patch:
-    radius: float = MISSING
-    rings: int = 5
-    rays: int = 16
-    weights: str = "interpolation"
+class OptimSettings(Settings):
+    """Adam, and the course of its learning rate."""
+
+    epochs: int = Field(ge=1, description="number of epochs")
+    lr: float = Field(gt=0, description="largest learning rate")
+    betas: list[float] = Field(description="Adam's two decay rates, each in 0..1")
+    schedule: Literal["cosine", "constant"] = Field(
+        description="cosine: up to lr during `warmup`, then down to near 0; or constant"
+    )
+    warmup: float = Field(ge=0, description="share of all steps before the rate is largest")
+
+    @field_validator("betas")
+    @classmethod
+    def _two_shares(cls, betas: list[float]) -> list[float]:
+        if len(betas) != 2 or not all(0 <= beta < 1 for beta in betas):
+            raise ValueError("must be two numbers in 0..1, 1 excluded")
+        return betas
 
 
-@dataclass
-class GCNN3(Model):
-    patch: Patch = field(default_factory=Patch)
+class TrainerSettings(Settings):
+    """Lightning's trainer."""
+
+    accelerator: str = Field(description="cpu, gpu, or auto: a GPU if there is one")
+    devices: Any = Field(description="number of devices, their list, or auto")
+    strategy: str = Field(description="auto, or ddp for several devices")
+    precision: Annotated[
+        Literal["32", "64", "bf16", "auto"],
+        BeforeValidator(lambda value: str(value) if isinstance(value, int) else value),
+    ] = Field(description="32, 64, bf16, or auto: bf16 where the hardware has it, else 32")
+    threads: Threads
+    val_every: int = Field(ge=1, description="epochs from one validation to the next")
 
 
-@dataclass
-class Shot:
-    radius: float = MISSING
-    bins: int = 16
+class TrainConfig(Settings):
+    """Settings of `train`."""
+
+    seq_len: int = Field(ge=1, description="number of vertices N of a spiral")
+    metric: bool | None = Field(
+        description="true: every element of a spiral also carries its distance and angle"
+    )
+    seed: int = Field(ge=0, lt=2**32, description="seed of weights, order, spirals and dropout")
+    resume: Text | None = Field(description="folder of a stopped run to resume")
+    plugins: Plugins
+    model: SerializeAsAny[Network.Settings]
+    neighbourhood: SerializeAsAny[Neighbourhood.Settings]
+    data: SerializeAsAny[DataSettings]
+    trainer: TrainerSettings
+    optim: OptimSettings
+    picture: bool = Field(description="render test shapes after the test")
+
+    @model_validator(mode="after")
+    def _fit_together(self) -> Self:
+        network = Network.registered[self.model.name]
+        around = Neighbourhood.of(self.neighbourhood)
+        if network.reads != around.gives:
+            fitting = [n for n, c in Neighbourhood.registered.items() if c.gives == network.reads]
+            raise ValueError(
+                f"model {network.name} needs a neighbourhood that gives {network.reads} "
+                f"({', '.join(fitting)}), got neighbourhood {around.name}"
+            )
+        network.check(around)
+        if self.trainer.val_every > self.optim.epochs:
+            raise ValueError(
+                f"trainer.val_every must be at most optim.epochs ({self.optim.epochs}), "
+                f"got {self.trainer.val_every}"
+            )
+        return self
 
 
-@dataclass
-class Remesh:
-    policy: str = "isotropic"
-    vertices: int | None = None
-    copies: int = 1
+class EvaluateConfig(Settings):
+    """Settings of `evaluate`."""
+
+    run: Text = Field(description="folder of a run")
+    data: dict[str, Any] | None = Field(
+        description="another data set with the same template: data=faust_benchmark data.root=..."
+    )
+    rotations: int = Field(
+        ge=0, description="100: that many more predictions, each with other random spirals"
+    )
+    shapes: int | list[str] = Field(description="test shapes to draw: how many, or their names")
+    accelerator: Accelerator
+    threads: Threads
+    plugins: Plugins
+
+    @field_validator("rotations")
+    @classmethod
+    def _comparable(cls, rotations: int) -> int:
+        if rotations == 1:
+            raise ValueError("must be 0 or at least 2")
+        return rotations
+
+    @field_validator("shapes", mode="before")
+    @classmethod
+    def _number_or_names(cls, shapes: Any) -> Any:
+        number = isinstance(shapes, int) and not isinstance(shapes, bool) and shapes >= 0
+        names = isinstance(shapes, list) and all(isinstance(name, str) for name in shapes)
+        if not (number or names):
+            raise ValueError("must be a number of test shapes, or a list of their names")
+        return shapes
 
 
-@dataclass
-class Data:
-    name: str = MISSING
-    remesh: Remesh | None = None
-    shot: Shot = field(default_factory=Shot)
-    shuffle_vertices: bool = False
-    cache_dir: str = MISSING
-    workers: int | None = None
+class MatchConfig(Settings):
+    """Settings of `match`."""
+
+    source: Text | None = Field(description="mesh file: PLY, OBJ, OFF, STL or GLB")
+    sources: Text | None = Field(description="instead of source: a pattern of many mesh files")
+    target: Text | None = Field(
+        description="mesh file to match to; without it, sources are labelled with the template only"
+    )
+    run: Text | None = Field(description="folder of a run; null: the bundled network")
+    output: Text | None = Field(description="folder to write to; null: under outputs/matches")
+    repair: bool = Field(description="repair meshes that could not be used, and say how")
+    resample: bool | None = Field(
+        description="predict at the density of the training meshes; null: only if it is far off"
+    )
+    smooth: bool = Field(description="refine the map by ZoomOut, for complete surfaces")
+    transfer: Text | None = Field(
+        description="carry color, uv, or a .npy array [V, ...] of the target to the source"
+    )
+    picture: bool | None = Field(description="render; null: with source= yes, with sources= no")
+    accelerator: Accelerator
+    workers: int | None = Field(ge=1, description="processes, with sources=; null: one per core")
+    plugins: Plugins
+
+    @field_validator("source", "sources", "target", "run", "output", "transfer")
+    @classmethod
+    def _not_empty(cls, value: str | None) -> str | None:
+        if value == "":
+            raise ValueError("must not be empty; leave it out, or give a path")
+        return value
+
+    @model_validator(mode="after")
+    def _complete(self) -> Self:
+        if (self.source is None) == (self.sources is None):
+            raise ValueError("give source=, a mesh, or sources=, a pattern such as 'scans/*.ply'")
+        if self.transfer and not self.target:
+            raise ValueError("transfer= carries values of the target to the source; give target=")
+        return self
 
 
-@dataclass
-class Bodies(Data):
-    vertices: int = 1500
+class MeshesConfig(Settings):
+    """Settings of `meshes`."""
+
+    data: SerializeAsAny[DataSettings]
+    split: Literal["train", "val", "test"] | None = Field(
+        description="train, val or test; null: all"
+    )
+    plugins: Plugins
 
 
-@dataclass
-class Faust(Data):
-    root: str | None = None
+class ReportConfig(Settings):
+    """Settings of `report`."""
+
+    runs: Text = Field(description="folder that contains runs at any depth, or a pattern")
+    output: Text | None = Field(description="folder to write to; null: report/ beside the runs")
+    shapes: int = Field(ge=0, description="test shapes of each run to show in 3D")
+    plugins: Plugins
 
 
-@dataclass
-class FaustBenchmark(Data):
-    root: str | None = None
-    benchmark_root: str | None = None
-    policy: str = "iso"
-    train: list[str] | None = None
+class BenchmarkConfig(Settings):
+    """Settings of `benchmark`."""
+
+    vertices: Literal[1500, 6890] = Field(description="vertices of the mesh and of the template")
+    seq_len: int = Field(ge=1, description="number of vertices N of a spiral")
+    repeats: int = Field(ge=1, description="repetitions of every measurement; medians are shown")
+    accelerator: Accelerator
+    precision: Annotated[
+        Literal["32", "bf16", "auto"],
+        BeforeValidator(lambda value: str(value) if isinstance(value, int) else value),
+    ] = Field(description="precision of our step: 32, bf16, or auto")
+    threads: Threads
+    models: list[str] = Field(description="networks to measure")
+    parts: list[Literal["steps", "memory", "preprocessing", "scaling"]] = Field(
+        description="what to measure"
+    )
+    plugins: Plugins
 
 
-@dataclass
-class Folder(Data):
-    root: str | None = None
-    template: str | None = None
-    train: Any = field(default_factory=list)
-    val: Any = field(default_factory=list)
-    test: Any = field(default_factory=list)
-    labels: str | None = "{stem}.txt"
+# ---------------------------------------------------------------------------------- reading configs
 
 
-@dataclass
-class Optim:
-    epochs: int = MISSING
-    lr: float = MISSING
-    betas: list[float] = field(default_factory=lambda: [0.9, 0.999])
-    schedule: str = MISSING
-    warmup: float = 0.1
+def read_config(schema: type[C], config: DictConfig | dict[str, Any]) -> C:
+    """A composed config with every value of its declared type and within its range.
 
+    The modules that its `plugins` name are imported first.
 
-@dataclass
-class Trainer:
-    accelerator: str = "cpu"
-    devices: Any = 1
-    strategy: str = "auto"
-    precision: str = "32"
-    threads: int | None = None
-    val_every: int = 1
-
-
-@dataclass
-class Train:
-    seq_len: int = MISSING
-    metric: bool | None = None
-    seed: int = 0
-    resume: str | None = None
-    model: Any = MISSING
-    data: Any = MISSING
-    trainer: Trainer = field(default_factory=Trainer)
-    optim: Optim = field(default_factory=Optim)
-    picture: bool = True
-
-
-MODELS = {"fcs": FCS, "lstm": LSTM, "gcnn3": GCNN3}
-DATASETS = {"bodies": Bodies, "faust": Faust, "faust_benchmark": FaustBenchmark, "folder": Folder}
-
-AT_LEAST = {
-    "seq_len": 1,
-    "seed": 0,
-    "optim.epochs": 1,
-    "optim.warmup": 0,
-    "data.workers": 1,
-    "data.shot.bins": 1,
-    "data.remesh.vertices": 12,
-    "data.remesh.copies": 1,
-    "model.rings": 1,
-    "model.patch.rings": 1,
-    "trainer.threads": 1,
-    "trainer.val_every": 1,
-}
-ABOVE_ZERO = ("optim.lr", "data.shot.radius", "model.feature_scale", "model.patch.radius")
-ONE_OF = {
-    "optim.schedule": ("cosine", "constant"),
-    "model.metric_layers": ("all", "first"),
-    "model.patch.weights": ("interpolation", "gaussian"),
-    "data.remesh.policy": ("isotropic", "adaptive", "refined", "simplified", "marching", "mixed"),
-    "trainer.precision": ("32", "64", "bf16", "auto"),
-}
-
-
-def checked(config: DictConfig) -> DictConfig:
-    """The composed config with every value of its declared type, within its range.
-
-    Errors: ConfigError for an unknown key, a value of another type, or one out of range.
+    Raises:
+        ConfigError: An unknown key, a value of another type, or one out of range.
     """
-    schema = OmegaConf.structured(Train)
-    plain = OmegaConf.to_container(config, resolve=True)
-    for group, schemas in (("model", MODELS), ("data", DATASETS)):
-        schema[group] = _one_of(plain[group], group, schemas)
-    _known(plain, Train, "")
-    _known(plain["trainer"], Trainer, "trainer.")
-    _known(plain["optim"], Optim, "optim.")
-    _known(plain["data"]["shot"], Shot, "data.shot.")
-    if "patch" in schema.model:
-        _known(plain["model"]["patch"], Patch, "model.patch.")
-    if "metric" in schema.model:
-        if plain.get("metric") is not None:
-            plain["model"]["metric"] = plain["metric"]  # the root key wins over an experiment's
-        elif plain["model"].get("metric") is None:
-            plain["model"]["metric"] = False
-    elif plain.get("metric"):
-        raise ConfigError(
-            "metric=true needs a model with spirals, whose elements carry it; "
-            f"got model {plain['model']['name']}"
-        )
-    _fill(schema, plain)
-    _check_ranges(schema)
-    return schema
+    values = _as_dict(config)
+    load_plugins(values.get("plugins", []))
+    return _read(schema, values)
 
 
-def checked_data(config: DictConfig) -> DictConfig:
-    """A data config alone, in the same way."""
-    plain = OmegaConf.to_container(config, resolve=True)
-    schema = _one_of(plain, "data", DATASETS)
-    _fill(schema, plain)
-    _check_values(OmegaConf.create({"data": schema}))
-    return schema
+def read_stored_config(values: dict[str, Any], source: str = "the config") -> TrainConfig:
+    """The config of a run folder or checkpoint, also of an earlier version. Imports no plugins.
+
+    Args:
+        values: The stored config.
+        source: Where it comes from, for messages.
+
+    Raises:
+        ConfigError: As for `read_config`; or it names a network, neighbourhood or data set that
+            only a plugin defines. The message names the plugin.
+    """
+    values = upgraded(_as_dict(values))
+    for group, base in GROUPS.items():
+        name = _name(values.get(group), group)
+        if name not in base.registered and values["plugins"]:
+            plugins = ",".join(values["plugins"])
+            raise ConfigError(
+                f"{source} needs {group} {name} of a plugin; to import it, add plugins=[{plugins}]"
+            )
+    return _read(TrainConfig, values)
 
 
-def _one_of(plain: Any, group: str, schemas: dict[str, type]) -> DictConfig:
-    """The schema that a group's name chooses."""
-    _is_group(plain, group)
-    if plain.get("name") not in schemas:
-        raise ConfigError(
-            f"{group}.name must be one of {', '.join(schemas)}; got {plain.get('name')}"
-        )
-    _known(plain, schemas[plain["name"]], f"{group}.")
-    schema = OmegaConf.structured(schemas[plain["name"]])
-    if plain.get("remesh") is not None:
-        _known(plain["remesh"], Remesh, "data.remesh.")
-        schema.remesh = OmegaConf.structured(Remesh)
-    return schema
+def upgraded(values: dict[str, Any]) -> dict[str, Any]:
+    """A stored config of this or an earlier version in today's layout.
+
+    A setting that was added later gets the value that reproduces the behaviour of its time.
+    """
+    values = copy.deepcopy(values)
+    model, data = values.get("model"), values.get("data")
+    if not (isinstance(model, dict) and isinstance(data, dict)):
+        return values  # reported by whoever reads it
+    if "neighbourhood" not in values:  # up to version 0.1 these were settings of the model
+        if patch := model.pop("patch", None):
+            values["neighbourhood"] = {"name": "patch", "weights": "interpolation", **patch}
+        else:
+            rings = model.pop("rings", None)
+            sequence = {"seq_len": values.get("seq_len"), "rings": rings}
+            values["neighbourhood"] = {"name": "spiral", **sequence}
+    if "metric" in model:
+        model.setdefault("metric_layers", "all")
+    if data.get("remesh"):
+        data["remesh"].setdefault("copies", 1)
+    data.setdefault("remesh", None)
+    data.setdefault("shuffle_vertices", False)
+    values.setdefault("plugins", [])
+    values.setdefault("picture", True)
+    return values
 
 
-def typed(config: DictConfig, schema: type) -> DictConfig:
-    """A flat config with every value of its declared type. Errors: ConfigError as above."""
-    plain = OmegaConf.to_container(config, resolve=True)
-    _known(plain, schema, "")
-    filled = OmegaConf.structured(schema)
-    _fill(filled, plain)
-    return filled
+def load_plugins(names: list[str]) -> None:
+    """Import modules that register networks, neighbourhoods or data sets.
 
+    Modules are looked for in the current folder too.
 
-def _fill(schema: DictConfig, plain: dict[str, Any]) -> None:
-    for key, value in flat(plain).items():
+    Raises:
+        ConfigError: A module cannot be imported.
+    """
+    if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
+        raise ConfigError(f"plugins must be a list of modules, got {names}")
+    if names and os.getcwd() not in sys.path:
+        sys.path.insert(0, os.getcwd())
+    for name in names:
         try:
-            OmegaConf.update(schema, key, value)
-        except OmegaConfBaseException as error:
-            reason = str(error).splitlines()[0]
-            raise ConfigError(f"{key}={value}: {reason}") from error
+            importlib.import_module(name)
+        except Exception as error:  # whatever the module's code raises
+            reason = f"{type(error).__name__}: {error}"
+            raise ConfigError(f"plugins: cannot import {name} ({reason})") from error
 
 
-def _check_values(typed: DictConfig) -> None:
-    """Those that need no others to be judged by."""
-    for key, least in AT_LEAST.items():
-        value = OmegaConf.select(typed, key)
-        if value is not None and value < least:
-            raise ConfigError(f"{key} must be at least {least}; got {value}")
-    for key in ABOVE_ZERO:
-        value = OmegaConf.select(typed, key)
-        if value is not None and not 0 < value < math.inf:
-            raise ConfigError(f"{key} must be above 0; got {value}")
-    for key, values in ONE_OF.items():
-        if (value := OmegaConf.select(typed, key)) not in (None, *values):
-            raise ConfigError(f"{key} must be one of {', '.join(values)}; got {value}")
+GROUPS = {"model": Network, "neighbourhood": Neighbourhood, "data": ShapeSet}
 
 
-def _check_ranges(typed: DictConfig) -> None:
-    if missing := sorted(OmegaConf.missing_keys(typed)):
-        raise ConfigError(f"{missing[0]} must be given")
-    _check_values(typed)
-    if typed.trainer.val_every > typed.optim.epochs:
+def _as_dict(config: DictConfig | dict[str, Any]) -> dict[str, Any]:
+    if OmegaConf.is_config(config):
+        return OmegaConf.to_container(config, resolve=True)
+    return copy.deepcopy(config)
+
+
+def _name(values: Any, group: str) -> Any:
+    if not isinstance(values, dict):
+        raise ConfigError(f"{group} must be a group of settings, got {values}")
+    return values.get("name")
+
+
+def _read(schema: type[C], values: dict[str, Any]) -> C:
+    """As `read_config`, without plugins."""
+    values = dict(values)
+    if schema is TrainConfig:
+        _spread_metric(values)
+    for group, base in GROUPS.items():
+        typed = schema.model_fields.get(group)
+        if typed is None or _model(typed.annotation) is None:
+            continue
+        name = _name(values.get(group), group)
+        if name not in base.registered:
+            choices = ", ".join(sorted(base.registered))
+            raise ConfigError(f"{group}.name must be one of {choices}, got {name}")
+        values[group] = _validated(base.registered[name].Settings, values[group], f"{group}.")
+    return _validated(schema, values, "")
+
+
+def _spread_metric(values: dict[str, Any]) -> None:
+    """Give the model the root key `metric`, which wins over what an experiment file sets."""
+    model = values.get("model")
+    network = Network.registered.get(_name(model, "model"))
+    if network is None:
+        return
+    values["model"] = model = dict(model)
+    if "metric" in network.Settings.model_fields:
+        if values.get("metric") is not None:
+            model["metric"] = values["metric"]
+        elif model.get("metric") is None:
+            model["metric"] = False
+    elif values.get("metric"):
         raise ConfigError(
-            f"trainer.val_every must be at most optim.epochs, {typed.optim.epochs}: without a "
-            f"validation there is no best checkpoint; got {typed.trainer.val_every}"
+            f"metric=true needs a model that reads metric information, got model {network.name}"
         )
-    if len(typed.optim.betas) != 2 or not all(0 <= beta < 1 for beta in typed.optim.betas):
-        raise ConfigError(
-            f"optim.betas must be two numbers in 0..1, 1 left out; got {typed.optim.betas}"
-        )
-    if typed.data.name == "folder":
-        for split in ("train", "val", "test"):
-            names = typed.data[split]
-            listed = [names] if isinstance(names, str) else names
-            is_list = isinstance(listed, list | ListConfig)
-            if not is_list or not all(isinstance(name, str) for name in listed):
-                raise ConfigError(f"data.{split} must be file names or patterns; got {names}")
-    if typed.seed >= 2**32:
-        raise ConfigError(f"seed must be below {2**32}; got {typed.seed}")
-    if len(typed.model.channels) != 3 or min(typed.model.channels) < 1:
-        raise ConfigError(
-            f"model.channels must hold three numbers of at least 1; got {typed.model.channels}"
-        )
-    if "patch" in typed.model and (typed.model.patch.rays < 2 or typed.model.patch.rays % 2):
-        raise ConfigError(
-            f"model.patch.rays must be even and at least 2; got {typed.model.patch.rays}"
-        )
-    if not 0 <= typed.model.dropout < 1:
-        raise ConfigError(f"model.dropout must be in 0..1, 1 left out; got {typed.model.dropout}")
+
+
+def _validated(schema: type[C], values: dict[str, Any], prefix: str) -> C:
+    _check_keys(schema, values, prefix)
+    try:
+        return schema.model_validate(values)
+    except ValidationError as error:
+        raise ConfigError(_message(error.errors()[0], schema, prefix)) from error
+
+
+def _check_keys(schema: type[BaseModel], values: Any, prefix: str) -> None:
+    """Raise ConfigError for a key that the schema does not have, at any depth."""
+    if isinstance(values, BaseModel):
+        return
+    if not isinstance(values, dict):
+        raise ConfigError(f"{prefix.removesuffix('.')} must be a group of settings, got {values}")
+    names = list(schema.model_fields)
+    for key, value in values.items():
+        if key not in names:
+            if moved := MOVED.get(f"{prefix}{key}"):
+                raise ConfigError(f"unknown key {prefix}{key}; it is {moved} now")
+            close = difflib.get_close_matches(str(key), names, n=1)
+            hint = f"did you mean {prefix}{close[0]}?" if close else f"known: {', '.join(names)}"
+            raise ConfigError(f"unknown key {prefix}{key}; {hint}")
+        annotation = schema.model_fields[key].annotation
+        group = _model(annotation)
+        optional = type(None) in typing.get_args(annotation)
+        if group is not None and not (value is None and optional):
+            _check_keys(group, value, f"{prefix}{key}.")
+
+
+MOVED = {"model.rings": "neighbourhood.rings", "model.patch": "a setting of neighbourhood"}
+
+
+def _model(annotation: Any) -> type[BaseModel] | None:
+    """The group of settings that an annotation stands for, if it is one."""
+    for kind in (annotation, *typing.get_args(annotation)):
+        if inspect.isclass(kind) and issubclass(kind, BaseModel):
+            return kind
+    return None
+
+
+RULES = {
+    "int_type": "must be a whole number",
+    "int_from_float": "must be a whole number",
+    "float_type": "must be a number",
+    "bool_type": "must be true or false",
+    "string_type": "must be text",
+    "list_type": "must be a list",
+    "dict_type": "must be a group of settings",
+    "greater_than_equal": "must be at least {ge:.10g}",
+    "greater_than": "must be above {gt:.10g}",
+    "less_than_equal": "must be at most {le:.10g}",
+    "less_than": "must be below {lt:.10g}",
+    "finite_number": "must be a finite number",
+    "literal_error": "must be one of {choices}",
+    "too_short": "must have at least {min_length} values",
+    "too_long": "must have at most {max_length} values",
+}
+
+
+def _message(error: Any, schema: type[BaseModel], prefix: str) -> str:
+    """One line for an error of pydantic: the key, the rule and the value."""
+    context = dict(error.get("ctx", {}))
+    if "expected" in context:
+        expected = str(context["expected"]).replace(" or ", ", ").replace("'", "")
+        context["choices"] = expected
+    parts = [str(part) for part in error["loc"]]
+    key = prefix + ".".join(part for part in parts if part.isidentifier())
+    if not parts:  # of the whole config, in words of its own
+        return str(context["error"])
+    if error["type"] == "missing" or error["input"] is None:
+        return f"{key}= is missing: {_description(schema, parts)}"
+    rule = RULES.get(error["type"], error["msg"]).format(**context)
+    if error["type"] == "value_error":
+        rule = str(context["error"])
+    return f"{key} {rule}, got {_shown(error['input'])}"
+
+
+def _shown(value: Any) -> str:
+    return "null" if value is None else str(value)
+
+
+def _description(schema: type[BaseModel], parts: list[str]) -> str:
+    """The help text of a setting."""
+    for part in parts[:-1]:
+        schema = _model(schema.model_fields[part].annotation) or schema
+    return schema.model_fields[parts[-1]].description or "a group of settings"
 
 
 def flat(tree: dict[str, Any], prefix: str = "") -> dict[str, Any]:
@@ -287,18 +462,3 @@ def flat(tree: dict[str, Any], prefix: str = "") -> dict[str, Any]:
         else:
             leaves[prefix + key] = value
     return leaves
-
-
-def _is_group(given: Any, name: str) -> None:
-    if not isinstance(given, dict):
-        raise ConfigError(f"{name} is a group of settings; got {given}")
-
-
-def _known(given: Any, schema: type, prefix: str) -> None:
-    _is_group(given, prefix.removesuffix("."))
-    names = [f.name for f in fields(schema)]
-    for key in given:
-        if key not in names:
-            close = difflib.get_close_matches(key, names, n=1)
-            hint = f"did you mean {prefix}{close[0]}?" if close else f"known: {', '.join(names)}"
-            raise ConfigError(f"unknown key {prefix}{key}; {hint}")

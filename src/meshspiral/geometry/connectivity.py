@@ -1,4 +1,4 @@
-"""Who stands around whom: the clockwise one-ring of every vertex."""
+"""Connectivity of a mesh: the clockwise one-ring and the fans of every vertex."""
 
 from __future__ import annotations
 
@@ -13,45 +13,65 @@ OPEN, CLOSED = 1, 2  # kinds of fans
 def one_rings(mesh: Mesh) -> tuple[np.ndarray, np.ndarray]:
     """The neighbours of every vertex, clockwise as seen from outside (against the faces' winding).
 
-    Returns (neighbours int32 [E], first int64 [V+1]); the one-ring of v is
-    neighbours[first[v]:first[v+1]], and E counts directed edges. An inner vertex's ring is a cycle
-    and begins anywhere; a boundary vertex's ring is an open fan, from one boundary edge to the
-    other. A vertex without a face has none.
+    The ring of an inner vertex is a cycle with an arbitrary first neighbour. The ring of a boundary
+    vertex is an open fan, from one boundary edge to the other. An isolated vertex has none.
 
-    Where several fans meet in one vertex (a bow tie), they are listed one after another, each
-    clockwise: a closed fan from the neighbour nearest to the vertex, the fans in the order of the
-    distance of their first neighbour. Nothing depends on the numbering of vertices or faces.
+    At a bow tie, a vertex where several fans meet, the fans follow one another, each clockwise. A
+    closed fan begins with the neighbour nearest to the vertex; the fans are sorted by the distance
+    of their first neighbour. This order does not depend on the numbering of vertices or faces.
+
+    Args:
+        mesh: The surface.
+
+    Returns:
+        The neighbours, int32 [E], and the start of every ring, int64 [V+1]: the one-ring of v is
+        neighbours[first[v]:first[v+1]]. E is the number of directed edges.
     """
-    neighbours, first, begins = _one_rings(mesh.faces, len(mesh.vertices))
-    for v in np.flatnonzero(_fans(first, begins) > 1):
-        here = slice(first[v], first[v + 1])
-        ring, begin = neighbours[here], begins[here]
+    neighbours, first, fan_kinds = _one_rings(mesh.faces, len(mesh.vertices))
+    for v in np.flatnonzero(_fan_counts(first, fan_kinds) > 1):
+        ring_slice = slice(first[v], first[v + 1])
+        ring, kinds = neighbours[ring_slice], fan_kinds[ring_slice]
         distance = ((mesh.vertices[ring] - mesh.vertices[v]) ** 2).sum(axis=1)
-        parts = np.split(np.arange(len(ring)), np.flatnonzero(begin)[1:])
+        parts = np.split(np.arange(len(ring)), np.flatnonzero(kinds)[1:])
         parts = [
-            np.roll(part, -distance[part].argmin()) if begin[part[0]] == CLOSED else part
+            np.roll(part, -distance[part].argmin()) if kinds[part[0]] == CLOSED else part
             for part in parts
         ]
         parts.sort(key=lambda part: distance[part[0]])
-        neighbours[here] = ring[np.concatenate(parts)]
+        neighbours[ring_slice] = ring[np.concatenate(parts)]
     return neighbours, first
 
 
 def fans(mesh: Mesh) -> np.ndarray:
-    """The number of fans that the faces at every vertex make, int64 [V]: 1 where the surface is
-    manifold, more at a bow tie, 0 without a face."""
-    _, first, begins = _one_rings(mesh.faces, len(mesh.vertices))
-    return _fans(first, begins)
+    """The number of fans of every vertex.
+
+    Args:
+        mesh: The surface.
+
+    Returns:
+        int64 [V]: 1 where the surface is manifold, more at a bow tie, 0 at an isolated vertex.
+    """
+    _, first, fan_kinds = _one_rings(mesh.faces, len(mesh.vertices))
+    return _fan_counts(first, fan_kinds)
 
 
-def _fans(first: np.ndarray, begins: np.ndarray) -> np.ndarray:
-    return np.diff(np.concatenate([[0], np.cumsum(begins > 0)])[first])
+def _fan_counts(first: np.ndarray, fan_kinds: np.ndarray) -> np.ndarray:
+    """The number of fans of every vertex, int64 [V], from the output of `_one_rings`."""
+    return np.diff(np.concatenate([[0], np.cumsum(fan_kinds > 0)])[first])
 
 
 @njit(cache=True)
 def _one_rings(faces, count):
-    """Neighbours and first as `one_rings` gives them, but for the order of several fans; and
-    begins int8 [E]: OPEN or CLOSED where a fan of this kind begins, else 0."""
+    """The one-rings, with the fans of a bow tie in arbitrary order.
+
+    Args:
+        faces: int32 [F, 3].
+        count: Number of vertices.
+
+    Returns:
+        neighbours and first, as `one_rings` returns them; and fan_kinds, int8 [E]: OPEN or CLOSED
+        at the first neighbour of a fan, 0 at all others.
+    """
     corner_first = np.zeros(count + 1, np.int64)
     for face in faces:
         for v in face:
@@ -59,7 +79,7 @@ def _one_rings(faces, count):
     for v in range(count):
         corner_first[v + 1] += corner_first[v]
     fill = corner_first[:-1].copy()
-    source = np.empty(faces.size, np.int32)  # at a corner, clockwise leads from source ...
+    source = np.empty(faces.size, np.int32)  # around a corner, clockwise leads from source ...
     target = np.empty(faces.size, np.int32)  # ... to target, across the corner's face
     for face in faces:
         for i in range(3):
@@ -68,9 +88,9 @@ def _one_rings(faces, count):
             fill[a] += 1
 
     neighbours = np.empty(2 * faces.size, np.int32)
-    begins = np.zeros(2 * faces.size, np.int8)
+    fan_kinds = np.zeros(2 * faces.size, np.int8)
     first = np.zeros(count + 1, np.int64)
-    after = np.empty(count, np.int32)
+    after = np.empty(count, np.int32)  # the neighbour clockwise after x, valid if has_after[x] == v
     has_after = np.full(count, -1, np.int32)  # the last vertex for which after[x] was set
     has_before = np.full(count, -1, np.int32)
     listed = np.full(count, -1, np.int32)
@@ -82,12 +102,12 @@ def _one_rings(faces, count):
             after[source[k]] = target[k]
             has_after[source[k]] = v
             has_before[target[k]] = v
-        for kind in (OPEN, CLOSED):  # open fans first: what they leave is closed
+        for kind in (OPEN, CLOSED):  # open fans first: every neighbour left is in a closed one
             for k in corners:
                 x = source[k]
                 if listed[x] == v or (kind == OPEN and has_before[x] == v):
                     continue
-                begins[end] = kind
+                fan_kinds[end] = kind
                 while listed[x] != v:
                     listed[x] = v
                     neighbours[end] = x
@@ -95,4 +115,4 @@ def _one_rings(faces, count):
                     if has_after[x] == v:
                         x = after[x]
     first[count] = end
-    return neighbours[:end].copy(), first, begins[:end]
+    return neighbours[:end].copy(), first, fan_kinds[:end]

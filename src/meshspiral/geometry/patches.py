@@ -1,9 +1,10 @@
 """Geodesic polar patches (Masci, Boscaini, Bronstein, Vandergheynst 2015).
 
-Around every vertex stands a polar grid on the surface: rings of equal spacing, rays at equal
-angles. It is laid out with the exponential map: straightest geodesics (Polthier, Schmies 1998) are
-traced from the vertex by unfolding triangle after triangle into the plane, where each is a straight
-line. One that wraps round a finger is no longer the shortest; it stays straightest.
+A patch is a polar grid on the surface around a vertex: equally spaced rings, and rays at equal
+angles. The exponential map lays it out: straightest geodesics (Polthier, Schmies 1998) are traced
+from the vertex. Each triangle on the way is unfolded into the plane of the one before, where the
+geodesic is a straight line. A geodesic that wraps around a finger is no longer the shortest path,
+but still straightest.
 """
 
 from __future__ import annotations
@@ -16,15 +17,19 @@ from numba import njit
 from meshspiral.geometry.connectivity import one_rings
 from meshspiral.geometry.mesh import Mesh
 
-MOST_FACES = 10_000  # that one ray crosses; only damaged meshes reach it
+MOST_FACES = 10_000  # crossed by one ray; only damaged meshes reach this limit
 
 
 class PatchTable(NamedTuple):
-    """The samples of every vertex's grid, each the weighted sum of three vertices.
+    """The samples of every vertex's grid, each a weighted sum of the three vertices of a face.
 
-    indices: int32 [V, rings, rays, 3]. weights: float32, likewise: barycentric, none negative, of
-    sum 1; or all 0, with indices 0, where there is no such sample: the ray has left the surface
-    before, or the faces around the vertex have no angles to shoot it into.
+    A sample is missing where its ray has left the surface, and where the vertex has no faces with
+    an angle into which the ray could be shot.
+
+    Attributes:
+        indices: int32 [V, rings, rays, 3], the vertices; 0 at missing samples.
+        weights: float32 [V, rings, rays, 3], barycentric coordinates: non-negative, with sum 1; all
+            0 at missing samples.
     """
 
     indices: np.ndarray
@@ -32,40 +37,55 @@ class PatchTable(NamedTuple):
 
     @property
     def whole(self) -> np.ndarray:
-        """bool [V, rings, rays]: which samples there are."""
+        """bool [V, rings, rays]: whether each sample exists."""
         return self.weights.any(axis=3)
 
 
 def geodesic_patches(
     mesh: Mesh, radius: float, rings: int = 5, rays: int = 16, turn: np.ndarray | None = None
 ) -> PatchTable:
-    """The polar grid around every vertex, `rings` x `rays` samples up to distance `radius`.
+    """The polar grids of all vertices (Masci et al. 2015).
 
     Sample (i, j) lies at distance (i + 1) / rings * radius in direction (j + 1/2) 2 pi / rays,
-    counter-clockwise as seen from outside. Directions are measured in the angles of the one-ring,
-    from an arbitrary neighbour, and rescaled to 2 pi; at a boundary vertex as they are (unless they
-    exceed 2 pi), from the last edge clockwise, and the directions outside its faces have no
-    samples. Where several fans of faces meet in a vertex, their angles follow one another.
+    counter-clockwise as seen from outside. A direction is the sum of the faces' angles at the
+    vertex up to it, from an arbitrary neighbour, rescaled so that a full turn is 2 pi. At a
+    boundary vertex, angles are rescaled only if they sum to more than 2 pi; they start at the last
+    edge clockwise, and directions outside the faces have no samples. At a bow tie, the angles of
+    one fan follow those of the other.
 
-    radius: in the mesh's unit. turn: float [V], radians by which the grid of each vertex is turned
-    counter-clockwise; None for none. Errors: ValueError for a radius that is not positive and
-    finite, or rings or rays below 1.
+    Args:
+        mesh: The surface.
+        radius: Distance of the outermost ring, in the mesh's unit.
+        rings: Number of rings.
+        rays: Number of rays.
+        turn: float [V], radians by which the grid of each vertex is turned counter-clockwise. None
+            for no turn.
+
+    Returns:
+        The table of V * rings * rays samples.
+
+    Raises:
+        ValueError: `radius` is not positive and finite, or `rings` or `rays` is below 1.
     """
     check_grid(radius, rings, rays)
     neighbours, first = one_rings(mesh)
-    left = _left(mesh.faces, neighbours, first)
+    left = left_corners(mesh.faces, neighbours, first)
     shape = (len(mesh.vertices), rings, rays, 3)
     indices, weights = np.zeros(shape, np.int32), np.zeros(shape, np.float32)
-    for_numba = mesh.vertices, neighbours, first, left
-    onward = _onward(neighbours, first, left)
-    directions = _directions(*for_numba)
+    surface = mesh.vertices, neighbours, first, left
+    exits = _exit_edges(neighbours, first, left)
+    sectors = face_sectors(*surface)
     turn = np.zeros(len(mesh.vertices)) if turn is None else np.asarray(turn, dtype=np.float64)
-    _trace_all(*for_numba, onward, directions, turn, float(radius), indices, weights)
+    _trace_all(*surface, exits, sectors, turn, float(radius), indices, weights)
     return PatchTable(indices, weights)
 
 
 def check_grid(radius: float, rings: int, rays: int) -> None:
-    """Errors: ValueError for a grid that can't be."""
+    """Check the size of a polar grid.
+
+    Raises:
+        ValueError: `radius` is not positive and finite, or `rings` or `rays` is below 1.
+    """
     if not (np.isfinite(radius) and radius > 0):
         raise ValueError(f"radius must be positive and finite, got {radius}")
     if rings < 1 or rays < 1:
@@ -73,8 +93,8 @@ def check_grid(radius: float, rings: int, rays: int) -> None:
 
 
 @njit(cache=True)
-def _slot(neighbours, first, a, b):
-    """Where the directed edge from a to b stands in `neighbours`."""
+def _edge_index(neighbours, first, a, b):
+    """The index in `neighbours` of the directed edge from a to b, -1 if there is none."""
     for k in range(first[a], first[a + 1]):
         if neighbours[k] == b:
             return k
@@ -82,61 +102,85 @@ def _slot(neighbours, first, a, b):
 
 
 @njit(cache=True)
-def _left(faces, neighbours, first):
-    """int32 [E]: for every directed edge the third vertex of the face on its left, -1 if none."""
+def left_corners(faces, neighbours, first):
+    """The third vertex of the face on the left of every directed edge.
+
+    Args:
+        faces: int32 [F, 3].
+        neighbours, first: As `one_rings` returns them; neighbours has one entry per directed edge.
+
+    Returns:
+        int32 [E]; -1 where there is no face.
+    """
     left = np.full(len(neighbours), -1, np.int32)
     for face in faces:
         for i in range(3):
-            slot = _slot(neighbours, first, face[i], face[(i + 1) % 3])
-            left[slot] = face[(i + 2) % 3]
+            edge = _edge_index(neighbours, first, face[i], face[(i + 1) % 3])
+            left[edge] = face[(i + 2) % 3]
     return left
 
 
 @njit(cache=True)
-def _onward(neighbours, first, left):
-    """int32 [E, 2]: for the directed edge from c to b, with d on its left, the directed edges from
-    d to b and from c to d: those by which a ray leaves that face, seen from the next one."""
-    out = np.full((len(neighbours), 2), -1, np.int32)
+def _exit_edges(neighbours, first, left):
+    """The edges by which a ray leaves the face on the left of every directed edge.
+
+    Args:
+        neighbours, first: As `one_rings` returns them.
+        left: As `left_corners` returns it.
+
+    Returns:
+        int32 [E, 2]: for the directed edge from c to b, with d on its left, the directed edges from
+        d to b and from c to d. The next face is on the left of these. -1 where there is no face.
+    """
+    exits = np.full((len(neighbours), 2), -1, np.int32)
     for c in range(len(first) - 1):
         for k in range(first[c], first[c + 1]):
             d = left[k]
             if d >= 0:
-                out[k, 0] = _slot(neighbours, first, d, neighbours[k])
-                out[k, 1] = _slot(neighbours, first, c, d)
-    return out
+                exits[k, 0] = _edge_index(neighbours, first, d, neighbours[k])
+                exits[k, 1] = _edge_index(neighbours, first, c, d)
+    return exits
 
 
 @njit(cache=True)
-def _directions(vertices, neighbours, first, left):
-    """float64 [E, 2]: where the face on the left of each directed edge begins and ends around the
-    edge's source, counter-clockwise, as `geodesic_patches` measures directions."""
-    out = np.zeros((len(neighbours), 2))
+def face_sectors(vertices, neighbours, first, left):
+    """The interval of directions that the face on the left of every directed edge covers.
+
+    Args:
+        vertices: float64 [V, 3].
+        neighbours, first: As `one_rings` returns them.
+        left: As `left_corners` returns it.
+
+    Returns:
+        float64 [E, 2], begin and end in radians, counter-clockwise around the edge's source, in the
+        directions of `geodesic_patches`.
+    """
+    sectors = np.zeros((len(neighbours), 2))
     for v in range(len(first) - 1):
         total, is_open = 0.0, False
         for k in range(first[v + 1] - 1, first[v] - 1, -1):  # the one-ring is clockwise
-            out[k, 0] = total
+            sectors[k, 0] = total
             if left[k] >= 0:
-                total += _corner(vertices, v, neighbours[k], left[k])
+                total += _corner_angle(vertices, v, neighbours[k], left[k])
             else:
                 is_open = True
-            out[k, 1] = total
+            sectors[k, 1] = total
         if total > 2 * np.pi or (total > 0 and not is_open):
-            out[first[v] : first[v + 1]] *= 2 * np.pi / total
-    return out
+            sectors[first[v] : first[v + 1]] *= 2 * np.pi / total
+    return sectors
 
 
 @njit(cache=True)
-def _trace_all(
-    vertices, neighbours, first, left, onward, directions, turn, radius, indices, weights
-):
+def _trace_all(vertices, neighbours, first, left, exits, sectors, turn, radius, indices, weights):
+    """Trace the rays of all vertices; write indices and weights, [V, rings, rays, 3]."""
     rays = indices.shape[2]
     for v in range(len(first) - 1):
         for ray in range(rays):
             direction = ((ray + 0.5) * 2 * np.pi / rays + turn[v]) % (2 * np.pi)
             for k in range(first[v], first[v + 1]):
-                begin, end = directions[k]
+                begin, end = sectors[k]
                 if begin <= direction < end:
-                    corner = _corner(vertices, v, neighbours[k], left[k])
+                    corner = _corner_angle(vertices, v, neighbours[k], left[k])
                     right = corner * (direction - begin) / (end - begin)
                     _trace(
                         v,
@@ -146,7 +190,7 @@ def _trace_all(
                         vertices,
                         neighbours,
                         left,
-                        onward,
+                        exits,
                         radius,
                         indices[v, :, ray],
                         weights[v, :, ray],
@@ -156,24 +200,34 @@ def _trace_all(
 
 @njit(cache=True)
 def _trace(
-    v, edge, right_angle, left_angle, vertices, neighbours, left, onward, radius, indices, weights
+    v, edge, right_angle, left_angle, vertices, neighbours, left, exits, radius, indices, weights
 ):
-    """Follow one ray and write its samples, [rings, 3].
+    """Trace one ray and write its samples, [rings, 3].
 
-    The faces that it crosses are laid side by side into the plane, v at the origin and the ray
-    along x. It leaves each through an edge from b on its right (y <= 0) to c on its left (y >= 0).
+    The faces that it crosses are unfolded into the plane, with v at the origin and the ray along
+    the x axis. The ray leaves every face through an edge from b on its right (y <= 0) to c on its
+    left (y >= 0).
+
+    Args:
+        v: The vertex that the ray starts from.
+        edge: Index of the directed edge from v whose left face the ray starts in.
+        right_angle: Angle at v between that edge and the ray, in radians.
+        left_angle: Angle at v between the ray and the face's other edge at v.
+        vertices, neighbours, left, exits, radius: As in `geodesic_patches`.
+        indices: int32 [rings, 3], written.
+        weights: float32 [rings, 3], written.
     """
     rings = len(indices)
     b, c = neighbours[edge], left[edge]
-    length = _coordinates(vertices, v, b, b)[0]
+    length = edge_coordinates(vertices, v, b, b)[0]
     bx, by = length * np.cos(right_angle), -length * np.sin(right_angle)
-    length = _coordinates(vertices, v, c, c)[0]
+    length = edge_coordinates(vertices, v, c, c)[0]
     cx, cy = length * np.cos(left_angle), length * np.sin(left_angle)
     out_x, out_t = _crossing(bx, by, cx, cy)
-    corners = np.array([v, b, c])  # of the present face
-    entry = np.array([1.0, 0.0, 0.0])  # where the ray comes in, by its corners
-    leave = np.array([0.0, 1 - out_t, out_t])  # where it goes out
-    edge = onward[edge, 0]  # from now on that from c to b
+    corners = np.array([v, b, c])  # of the current face
+    entry = np.array([1.0, 0.0, 0.0])  # barycentric coordinates where the ray enters the face
+    leave = np.array([0.0, 1 - out_t, out_t])  # and where it leaves
+    edge = exits[edge, 0]  # from now on the edge from c to b
     in_x, ring = 0.0, 0
     for _ in range(MOST_FACES):
         while (ring + 1) / rings * radius <= out_x:
@@ -187,16 +241,16 @@ def _trace(
                 return
         d = left[edge]
         if d < 0:
-            return  # left the surface
+            return  # the ray has left the surface
         ex, ey = cx - bx, cy - by
         length = np.sqrt(ex * ex + ey * ey)
         ex, ey = (ex / length, ey / length) if length > 0 else (0.0, 1.0)
-        along, across = _coordinates(vertices, b, c, d)
+        along, across = edge_coordinates(vertices, b, c, d)
         dx, dy = bx + along * ex + across * ey, by + along * ey - across * ex
         corners[0], corners[1], corners[2] = b, c, d
         entry[0], entry[1], entry[2] = 1 - out_t, out_t, 0.0
         in_x = out_x
-        edge = onward[edge, 0 if dy > 0 else 1]
+        edge = exits[edge, 0 if dy > 0 else 1]
         if dy > 0:
             c, cx, cy = d, dx, dy
             out_x, out_t = _crossing(bx, by, cx, cy)
@@ -208,21 +262,32 @@ def _trace(
 
 
 @njit(cache=True)
-def _corner(vertices, v, b, c):
-    """The angle at v between b and c. A right angle where v coincides with one of them: the two
-    faces at such an edge then open half a turn to the rays, which go on into the faces around it.
+def _corner_angle(vertices, v, b, c):
+    """The angle at v between b and c, in radians.
+
+    A right angle where v coincides with b or c. The two faces at such an edge then offer half a
+    turn to the rays, which continue into the faces around the edge.
     """
-    along, across = _coordinates(vertices, v, b, c)
-    if along == 0 and across == 0 and _coordinates(vertices, v, b, b)[0] > 0:
+    along, across = edge_coordinates(vertices, v, b, c)
+    if along == 0 and across == 0 and edge_coordinates(vertices, v, b, b)[0] > 0:
         return np.pi / 2  # v and c coincide
     return np.arctan2(across, along)
 
 
 @njit(cache=True)
-def _coordinates(vertices, b, c, d):
-    """Of d - b: the length along c - b, and the length at right angles to it."""
+def edge_coordinates(vertices, b, c, d):
+    """The coordinates of d in the frame of the edge from b to c.
+
+    Args:
+        vertices: float64 [V, 3].
+        b, c, d: Indices of vertices. With c = d the first result is the length of the edge.
+
+    Returns:
+        The component of d - b along c - b, and the length of the component orthogonal to it. If b
+        and c coincide, the first is 0.
+    """
     dot, base, length = 0.0, 0.0, 0.0
-    for i in range(3):  # in scalars: arrays of three would cost more than all the rest
+    for i in range(3):  # in scalars: arrays of three would cost more than everything else
         to_c, to_d = vertices[c, i] - vertices[b, i], vertices[d, i] - vertices[b, i]
         dot, base, length = dot + to_c * to_d, base + to_c * to_c, length + to_d * to_d
     along = dot / np.sqrt(base) if base > 0 else 0.0
@@ -231,6 +296,6 @@ def _coordinates(vertices, b, c, d):
 
 @njit(cache=True)
 def _crossing(bx, by, cx, cy):
-    """Where the edge from b to c meets the x axis: x, and the share of c."""
+    """The crossing of the edge from b to c with the x axis: its x, and the weight of c there."""
     t = min(max(by / (by - cy), 0.0), 1.0) if by < cy else 1.0 * (cx > bx)  # or lies along it
     return (1 - t) * bx + t * cx, t

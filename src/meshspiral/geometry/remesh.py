@@ -1,10 +1,10 @@
-"""Other tessellations of a surface, and where their vertices came from.
+"""Remeshing: other tessellations of a surface, and the closest points of their vertices on it.
 
-The remeshing is PyMeshLab's: isotropic remeshing (Hoppe et al. 1993 in the explicit form of Botsch,
-Kobbelt 2004), simplification by quadrics (Garland, Heckbert 1997), marching cubes (Lorensen, Cline
-1987). Plain isotropic remeshing keeps much of the old tessellation. So the vertices are numbered at
-random first, on which the order of its steps depends, and then each policy remeshes finely before
-it comes to the resolution wanted.
+PyMeshLab does the remeshing: isotropic remeshing (Hoppe et al. 1993, in the explicit form of
+Botsch, Kobbelt 2004), simplification by quadrics (Garland, Heckbert 1997) and marching cubes
+(Lorensen, Cline 1987). Isotropic remeshing alone preserves much of the old tessellation. So the
+vertices are first renumbered at random, on which the order of its steps depends, and every policy
+remeshes finely before it goes to the resolution wanted.
 """
 
 from __future__ import annotations
@@ -17,15 +17,18 @@ from scipy.spatial import cKDTree
 
 from meshspiral.geometry.mesh import Mesh, MeshError
 
-NEAREST = 16  # faces tried first for a closest point
-FACING = 0.2  # least cosine between the normals of a vertex and of the face it is on
+NEAREST = 16  # faces, by their centres, that are tried first for a closest point
+FACING = 0.2  # least cosine between the normal of a point and that of its closest face
 
 
 class Remeshed(NamedTuple):
-    """A mesh, and for each of its vertices a point on the source.
+    """A remeshed surface, and the closest point on the source of each of its vertices.
 
-    faces: int64 [V], a face of the source. weights: float64 [V, 3], barycentric coordinates in it.
-    distance: float64 [V], from the vertex to that point.
+    Attributes:
+        mesh: The remeshed surface, with V vertices.
+        faces: int64 [V], the face of the source that the point lies in.
+        weights: float64 [V, 3], the barycentric coordinates of the point in that face.
+        distance: float64 [V], the distance of the vertex from that point, in the mesh's unit.
     """
 
     mesh: Mesh
@@ -35,20 +38,35 @@ class Remeshed(NamedTuple):
 
 
 def remesh(mesh: Mesh, vertices: int, policy: str = "isotropic", seed: int = 0) -> Remeshed:
-    """The surface with other vertices and faces, in random order.
+    """Remesh a surface; the new vertices are in random order.
 
-    vertices: how many; "marching" and open surfaces may have some per cent fewer. policy: one of
-    POLICIES: isotropic: edges of one length; adaptive: shorter where the surface is curved, see
-    `bending`; refined: shorter around four random places; simplified: a fine mesh reduced by
-    quadrics, its triangles stretched along the flat directions; marching: marching cubes, with
-    slivers, and thin parts lost; mixed: one of these, drawn by the seed. Errors: MeshError for
-    fewer than 12 vertices, for another policy, for a mesh that PyMeshLab can't remesh to that
-    size, or without PyMeshLab.
+    The policies:
+
+    - isotropic: edges of equal length.
+    - adaptive: edges that are shorter where the surface is curved, see `bending`.
+    - refined: edges that are shorter around four random vertices.
+    - simplified: a fine mesh reduced by quadrics, with triangles stretched along flat directions.
+    - marching: marching cubes, with slivers; thin parts are lost.
+    - mixed: one of these, drawn with the seed.
+
+    Args:
+        mesh: The source.
+        vertices: Number of vertices wanted. "marching" and open surfaces may have a few per cent
+            fewer.
+        policy: One of POLICIES.
+        seed: Determines all random choices.
+
+    Returns:
+        The remeshed surface and its closest points on the source.
+
+    Raises:
+        MeshError: `vertices` is below 12, the policy is unknown, PyMeshLab cannot remesh the source
+            to that size, or PyMeshLab is not installed.
     """
     if policy not in POLICIES:
         raise MeshError(f"policy must be one of {', '.join(POLICIES)}; got {policy!r}")
     if vertices < 12:
-        raise MeshError(f"a mesh of {vertices} vertices is no surface to learn on; at least 12")
+        raise MeshError(f"vertices must be at least 12, got {vertices}")
     rng = np.random.default_rng(seed)
     if policy == "mixed":
         policy = str(rng.choice([p for p in POLICIES if p != "mixed"]))
@@ -60,9 +78,7 @@ def remesh(mesh: Mesh, vertices: int, policy: str = "isotropic", seed: int = 0) 
             break
         tool.edge *= 0.97 * np.sqrt(count / vertices)
     else:
-        raise MeshError(
-            f"{mesh.name}: could not be remeshed to {vertices} vertices, but to {count}"
-        )
+        raise MeshError(f"{mesh.name}: cannot be remeshed to {vertices} vertices, got {count}")
     if count > vertices:
         tool.simplify()
     points, faces = tool.result()
@@ -73,12 +89,20 @@ def remesh(mesh: Mesh, vertices: int, policy: str = "isotropic", seed: int = 0) 
 def closest_points(
     mesh: Mesh, points: np.ndarray, normals: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The nearest point of the surface whose normal agrees: face int64 [Q], barycentric coordinates
-    float64 [Q, 3], distance float64 [Q].
+    """The closest points of a surface whose normals agree with those of the queries.
 
-    points, normals: float [Q, 3]. Where two parts of a surface touch, the nearer one may be the
-    wrong one; it faces the other way. Faces whose normal is off by more than arccos(0.2) are not
-    considered, unless there are no others.
+    Where two parts of a surface touch, the nearest point may be on the wrong one, which faces the
+    other way. Faces whose normal is off by more than arccos(FACING) are therefore considered only
+    if there are no others. A query with a NaN normal agrees with every face.
+
+    Args:
+        mesh: The surface.
+        points: float [Q, 3], the queries.
+        normals: float [Q, 3], their unit normals.
+
+    Returns:
+        The faces of the closest points, int64 [Q]; their barycentric coordinates, float64 [Q, 3];
+        and their distances, float64 [Q].
     """
     triangles = mesh.vertices[mesh.faces]
     centres = triangles.mean(axis=1)
@@ -88,12 +112,12 @@ def closest_points(
     )
     tree = cKDTree(centres)
     count = len(points)
-    face, place = np.zeros(count, dtype=np.int64), np.zeros((count, 3))
+    face, closest = np.zeros(count, dtype=np.int64), np.zeros((count, 3))
     distance = np.full(count, np.inf)
 
     def consider(queries: np.ndarray, faces: np.ndarray, facing: float = FACING) -> None:
-        """Of pairs [P] of a query and a face, ascending in the queries: keep what is nearer."""
-        # a vertex without a normal, NaN, agrees with all
+        """Update the closest points from pairs of a query and a face, [P], ascending in queries."""
+        # negated, so that a NaN normal agrees
         agrees = ~(np.einsum("px,px->p", normals[queries], directions[faces]) < facing)
         least = np.linalg.norm(points[queries] - centres[faces], axis=1) - reach[faces]
         worth = agrees & (least < distance[queries])
@@ -101,15 +125,16 @@ def closest_points(
         found = trimesh.triangles.closest_point(triangles[faces], points[queries])
         far = np.linalg.norm(found - points[queries], axis=1)
         order = np.lexsort((far, queries))
-        first = order[np.unique(queries[order], return_index=True)[1]]
+        first = order[np.unique(queries[order], return_index=True)[1]]  # the nearest of each query
         nearer = first[far[first] < distance[queries[first]]]
         changed = queries[nearer]
-        face[changed], place[changed], distance[changed] = faces[nearer], found[nearer], far[nearer]
+        face[changed], closest[changed] = faces[nearer], found[nearer]
+        distance[changed] = far[nearer]
 
     tried = min(NEAREST, len(centres))
     apart, near = (x.reshape(count, tried) for x in tree.query(points, k=tried))
     consider(np.repeat(np.arange(count), tried), near.ravel())
-    # a face not tried is farther than its centre less its reach
+    # a face is no nearer than its centre less its reach; the centres not tried are beyond `apart`
     unsure = np.flatnonzero((distance > apart[:, -1] - reach.max()) & np.isfinite(distance))
     others = tree.query_ball_point(points[unsure], distance[unsure] + reach.max())
     if len(unsure):
@@ -117,17 +142,24 @@ def closest_points(
     for facing in (FACING, -np.inf):
         for query in np.flatnonzero(np.isinf(distance)):
             consider(np.full(len(centres), query), np.arange(len(centres)), facing)
-    weights = trimesh.triangles.points_to_barycentric(triangles[face], place)
+    weights = trimesh.triangles.points_to_barycentric(triangles[face], closest)
     weights = np.clip(np.nan_to_num(weights, nan=1 / 3), 0, None)
     return face, weights / weights.sum(axis=1, keepdims=True), distance
 
 
 def bending(mesh: Mesh, radius: float) -> np.ndarray:
-    """How much the surface curves around each vertex, float64 [V] in 0..1: one less the length of
-    the mean of the normals within the radius, or two of the mesh's own edges if that is more.
+    """How strongly the surface bends around each vertex.
 
-    On a sphere of radius R it is (radius / 2R)^2, nearly. Normals that face the other way are of
-    another sheet, and do not count.
+    This is 1 minus the length of the mean of the normals within the radius. On a sphere of radius R
+    it is about (radius / 2R)^2. Normals that point the other way belong to another sheet and do not
+    count.
+
+    Args:
+        mesh: The surface.
+        radius: In the mesh's unit. It is at least two of the mesh's own mean edges.
+
+    Returns:
+        float64 [V], in 0..1.
     """
     radius = max(radius, 2 * mean_edge(mesh.area, len(mesh.vertices)))
     normals = np.nan_to_num(mesh.vertex_normals)
@@ -142,14 +174,34 @@ def bending(mesh: Mesh, radius: float) -> np.ndarray:
 
 
 def mean_edge(area: float, vertices: int) -> float:
-    """Of a mesh of equilateral triangles."""
+    """The edge length of a closed mesh of equilateral triangles.
+
+    Args:
+        area: Its surface area.
+        vertices: Its number of vertices.
+
+    Returns:
+        The length, in the unit of the area's square root.
+    """
     return float(np.sqrt(2 / np.sqrt(3) * area / vertices))
 
 
 class Tool:
-    """One mesh in PyMeshLab. Every parameter is given each time: it remembers those of other calls.
+    """One mesh in PyMeshLab.
 
-    edge: the length of the edges of an isotropic mesh with as many vertices as wanted.
+    Every parameter is passed in every call, because PyMeshLab remembers those of earlier calls.
+
+    Args:
+        mesh: The source.
+        vertices: Number of vertices wanted.
+        rng: Renumbers the source.
+
+    Attributes:
+        edge: The edge length of an isotropic mesh with the number of vertices wanted. `remesh`
+            shortens it if the result has too few.
+
+    Raises:
+        MeshError: PyMeshLab is not installed.
     """
 
     def __init__(self, mesh: Mesh, vertices: int, rng: np.random.Generator):
@@ -163,7 +215,7 @@ class Tool:
         self.reset()
 
     def reset(self) -> None:
-        """The source again, numbered at random."""
+        """Start again from the source, with vertices and faces in random order."""
         mesh = self.source.renumbered(self._rng.permutation(len(self.source.vertices)))
         faces = self._rng.permutation(mesh.faces)
         self._set = self._lab.MeshSet()
@@ -171,19 +223,23 @@ class Tool:
 
     @property
     def count(self) -> int:
+        """The number of vertices."""
         return self._set.current_mesh().vertex_number()
 
     def result(self) -> tuple[np.ndarray, np.ndarray]:
+        """The vertices, float64 [V, 3], and faces, int32 [F, 3], without isolated vertices."""
         self._set.meshing_remove_unreferenced_vertices()
         mesh = self._set.current_mesh()
         return mesh.vertex_matrix(), mesh.face_matrix()
 
     def border(self) -> int:
-        """The number of edges with one face."""
+        """The number of boundary edges."""
         edges = trimesh.geometry.faces_to_edges(self._set.current_mesh().face_matrix())
         return len(trimesh.grouping.group_rows(np.sort(edges, axis=1), require_count=1))
 
     def isotropic(self, edge: float, times: int, selected=False) -> None:
+        """Remesh isotropically to an edge length, in `times` iterations; only the selected faces if
+        `selected`."""
         self._set.meshing_isotropic_explicit_remeshing(
             iterations=times,
             adaptive=False,
@@ -200,7 +256,13 @@ class Tool:
         )
 
     def simplify(self, selected=False, placement=False) -> None:
-        """To the number of vertices wanted; selected: there alone, if that suffices."""
+        """Simplify by quadrics to the number of vertices wanted.
+
+        Args:
+            selected: Collapse edges of selected faces alone. If these are too few, nothing happens.
+            placement: Move the vertex of a collapsed edge to its best position, instead of to an
+                end of the edge.
+        """
         mesh = self._set.current_mesh()
         faces = mesh.selected_face_number() if selected else mesh.face_number()
         fewer = 2 * (self.count - self.vertices)  # a collapsed edge has two faces, at a border one
@@ -224,7 +286,12 @@ class Tool:
         )
 
     def select_bent(self, bent: np.ndarray, share: float) -> None:
-        """The most curved faces, up to that share of the area. bent: of the source's vertices."""
+        """Select the most curved faces.
+
+        Args:
+            bent: float64, the `bending` at the vertices of the source.
+            share: The share of the surface area to select.
+        """
         points, faces = self.result()
         bent = bent[cKDTree(self.source.vertices).query(points)[1]]
         order = np.argsort(-bent[faces].mean(axis=1))
@@ -236,6 +303,7 @@ class Tool:
         self._set.compute_selection_by_condition_per_face(condselect=f"(q0+q1+q2)/3 > {least}")
 
     def select_around(self, centres: np.ndarray, radius: float) -> None:
+        """Select the faces whose centres lie within a radius of one of the points [K, 3]."""
         near = " || ".join(
             f"(((x0+x1+x2)/3-({x}))^2+((y0+y1+y2)/3-({y}))^2+((z0+z1+z2)/3-({z}))^2 < {radius**2})"
             for x, y, z in centres.tolist()
@@ -243,10 +311,19 @@ class Tool:
         self._set.compute_selection_by_condition_per_face(condselect=near)
 
     def simplify_the_rest(self) -> None:
+        """Simplify the faces that are not selected, to the number of vertices wanted."""
         self._set.apply_selection_inverse(invfaces=True, invverts=False)
         self.simplify(selected=True)
 
     def marching_cubes(self, cell: float) -> None:
+        """Remesh the source by marching cubes, and discard all but the largest component.
+
+        Args:
+            cell: Edge length of the cubes.
+
+        Raises:
+            MeshError: No surface is found at that size.
+        """
         self.reset()
         self._set.generate_resampled_uniform_mesh(
             cellsize=self._lab.PureValue(cell),
@@ -258,24 +335,27 @@ class Tool:
         )
         pieces = trimesh.Trimesh(*self.result(), process=False).split(only_watertight=False)
         if not len(pieces):
-            raise MeshError(f"{self.source.name}: too thin for marching cubes of that size")
+            raise MeshError(f"{self.source.name}: too thin for marching cubes of size {cell:.3g}")
         largest = max(pieces, key=lambda piece: len(piece.vertices))
         self._set = self._lab.MeshSet()
         self._set.add_mesh(self._lab.Mesh(largest.vertices, largest.faces))
 
 
-def _finely(tool: Tool, rng: np.random.Generator) -> None:
+def _remesh_finely(tool: Tool, rng: np.random.Generator) -> None:
+    """Replace the tessellation of the source by a fine isotropic one."""
     tool.reset()
     tool.isotropic(rng.uniform(0.3, 0.4) * tool.edge, 4)
 
 
 def _isotropic(tool: Tool, rng: np.random.Generator) -> None:
-    _finely(tool, rng)
+    """Edges of equal length."""
+    _remesh_finely(tool, rng)
     tool.isotropic(tool.edge, 8)
 
 
 def _adaptive(tool: Tool, rng: np.random.Generator) -> None:
-    _finely(tool, rng)
+    """Edges that are shorter where the surface is curved."""
+    _remesh_finely(tool, rng)
     tool.isotropic(1.35 * tool.edge, 8)
     bent = bending(tool.source, tool.edge)
     for share, length in ((0.35, 0.85), (0.12, 0.55)):
@@ -286,7 +366,8 @@ def _adaptive(tool: Tool, rng: np.random.Generator) -> None:
 
 
 def _refined(tool: Tool, rng: np.random.Generator) -> None:
-    _finely(tool, rng)
+    """Edges that are shorter around four random vertices."""
+    _remesh_finely(tool, rng)
     tool.isotropic(1.2 * tool.edge, 8)
     vertices, _ = tool.result()
     centres = vertices[rng.integers(len(vertices), size=4)]
@@ -294,17 +375,19 @@ def _refined(tool: Tool, rng: np.random.Generator) -> None:
     tool.select_around(centres, radius)
     tool.isotropic(0.5 * tool.edge, 4, selected=True)
     tool.select_around(centres, radius)
-    tool.simplify_the_rest()  # what is refined stays so
+    tool.simplify_the_rest()
 
 
 def _simplified(tool: Tool, rng: np.random.Generator) -> None:
-    _finely(tool, rng)
-    tool.isotropic(rng.uniform(0.8, 1.2) * tool.edge, 3)  # the old vertices go
+    """A fine mesh reduced by quadrics."""
+    _remesh_finely(tool, rng)
+    tool.isotropic(rng.uniform(0.8, 1.2) * tool.edge, 3)  # removes the old vertices
     tool.isotropic(rng.uniform(0.35, 0.45) * tool.edge, 3)
     tool.simplify(placement=True)
 
 
 def _marching(tool: Tool, rng: np.random.Generator) -> None:
+    """Marching cubes, with cells fitted to the number of vertices wanted."""
     cell = 1.1 * tool.edge
     for _ in range(4):
         tool.marching_cubes(cell * rng.uniform(0.99, 1.01))
@@ -314,11 +397,11 @@ def _marching(tool: Tool, rng: np.random.Generator) -> None:
         cell *= np.sqrt(share) * 0.99
 
 
-POLICIES = {
+POLICIES = {  # how a Tool gets about the number of vertices wanted
     "isotropic": _isotropic,
     "adaptive": _adaptive,
     "refined": _refined,
     "simplified": _simplified,
     "marching": _marching,
-    "mixed": None,
+    "mixed": None,  # one of the others, see `remesh`
 }

@@ -1,4 +1,4 @@
-"""Making a usable mesh of a damaged one, with a record of what was changed."""
+"""Repair of damaged meshes, with a record of what was changed; and outward orientation."""
 
 from __future__ import annotations
 
@@ -9,16 +9,22 @@ import trimesh
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
+from meshspiral.geometry.faces import directed_edges, without_repeats
 from meshspiral.geometry.mesh import Mesh, MeshError, in_use
-from meshspiral.geometry.resample import without_repeats
 
-CLEARLY = 0.05
-HOLE = 0.1  # over the square root of the area: the radius of a sphere around what is closed
+CLEARLY = 0.05  # share of the volume of a sphere, see `outwards`
+HOLE = 0.1  # radius of the bounding sphere of a small hole, in square roots of the surface area
 
 
 class Repaired(NamedTuple):
-    """A mesh; place int64 [V], for every vertex as it was one of the mesh, or -1; origin int64 [W],
-    for every vertex of the mesh the one that it was; and what was changed, in words."""
+    """A repaired mesh, and how its vertices correspond to those of the input.
+
+    Attributes:
+        mesh: The repaired mesh, with W vertices.
+        place: int64 [V], for every vertex of the input its index in the mesh, or -1.
+        origin: int64 [W], for every vertex of the mesh its index in the input.
+        changes: What was changed, one sentence each.
+    """
 
     mesh: Mesh
     place: np.ndarray
@@ -27,78 +33,97 @@ class Repaired(NamedTuple):
 
 
 def repair(vertices: np.ndarray, faces: np.ndarray, name: str) -> Repaired:
-    """A mesh that `Mesh` accepts, of arrays that it may refuse.
+    """Make a mesh that `Mesh` accepts from arrays that it may refuse.
 
-    vertices: float [V, 3]. faces: int [F, 3]. In this order: faces go that name a vertex that is
-    not there or not finite, or one vertex twice, and faces that repeat another; vertices at one
-    place become one, faces without area by that go too; the surface is cut open along edges with
-    more than two faces; holes no larger than HOLE are closed, without new vertices; faces are
-    turned to agree with their neighbours, and along edges where they can't the surface is cut open
-    as well. Errors: MeshError if no face is left.
+    The steps, in this order:
+
+    1. Remove faces that name a missing or non-finite vertex, or one vertex twice, and faces that
+       repeat another.
+    2. Join vertices at equal coordinates, and remove the faces that thereby lose their area or
+       repeat another.
+    3. Cut the surface open along edges with more than two faces.
+    4. Close the holes that are no larger than HOLE, without new vertices.
+    5. Turn faces to agree with their neighbours, and cut the surface open along the edges where
+       they cannot.
+
+    Args:
+        vertices: float [V, 3], coordinates.
+        faces: int [F, 3], vertex indices.
+        name: Used in messages.
+
+    Returns:
+        The mesh and the correspondence of its vertices with the input.
+
+    Raises:
+        MeshError: An array does not have three columns, or no usable face is left.
     """
     vertices, faces = np.array(vertices, dtype=np.float64), np.array(faces, dtype=np.int64)
-    for array, what in ((vertices, "vertices"), (faces, "faces")):
+    for array, noun in ((vertices, "vertices"), (faces, "faces")):
         if array.ndim != 2 or array.shape[1] != 3:
-            raise MeshError(f"{name}: {what} must have three columns, got {array.shape}")
+            raise MeshError(f"{name}: {noun} must have three columns, got {array.shape}")
     changes: list[str] = []
 
-    def note(count: int, what: str) -> None:
+    def note(count: int, change: str) -> None:
         if count:
-            changes.append(f"{count:,} {what}")
+            changes.append(f"{count:,} {change}")
 
     finite = np.isfinite(vertices).all(axis=1)
     inside = ((faces >= 0) & (faces < len(vertices))).all(axis=1)
     faces = faces[inside]
     sound = finite[faces].all(axis=1)
-    note(int((~finite).sum()), "vertices with coordinates that are not finite left out")
-    note(int((~inside).sum()), "faces naming vertices that are not there left out")
-    note(int((~sound).sum()), "faces at vertices that are not finite left out")
-    faces, place = faces[sound], np.where(finite, np.arange(len(vertices)), -1)
+    note(int((~finite).sum()), "vertices with coordinates that are not finite removed")
+    note(int((~inside).sum()), "faces removed that name a vertex outside the mesh")
+    note(int((~sound).sum()), "faces removed at vertices that are not finite")
+    faces = faces[sound]
     before = len(faces)
     faces = without_repeats(faces)
-    note(before - len(faces), "faces left out that named a vertex twice or repeated another")
+    note(before - len(faces), "faces removed that name a vertex twice or repeat another face")
 
-    kept = np.flatnonzero(finite)
-    _, first, inverse = np.unique(
-        vertices[kept] + 0.0, axis=0, return_index=True, return_inverse=True
+    joined = _joined(vertices, finite)
+    note(
+        int((joined != np.arange(len(vertices))).sum()), "vertices joined with others at one point"
     )
-    one = np.arange(len(vertices))
-    one[kept] = kept[first[inverse.reshape(-1)]]
-    note(int((one != np.arange(len(vertices))).sum()), "vertices joined with others at their place")
-    place[kept] = one[kept]
     before = len(faces)
-    faces = without_repeats(one[faces])
-    note(before - len(faces), "faces left out that then were nothing or repeated another")
+    faces = without_repeats(joined[faces])
+    note(before - len(faces), "faces removed that collapsed or repeated another after joining")
     if not len(faces):
-        raise MeshError(f"{name}: no face that can be used")
+        raise MeshError(f"{name}: no usable face")
 
     vertices[~finite] = 0.0
-    vertices, faces, origin, cuts = cut_open(vertices, faces, crowded(faces))
+    nonmanifold = _multiplicity(np.sort(directed_edges(faces), axis=1)) > 2
+    vertices, faces, origin, cuts = _cut_open(vertices, faces, nonmanifold)
     note(cuts, "edges with more than two faces cut open")
     before = len(faces)
-    faces = closed(vertices, faces)
-    note(len(faces) - before, "faces put into holes")
-    wound = trimesh.Trimesh(vertices, faces, process=False)
-    trimesh.repair.fix_winding(wound)
-    turned = np.asarray(wound.faces, dtype=np.int64)
+    faces = _fill_holes(vertices, faces)
+    note(len(faces) - before, "faces added to close holes")
+    solid = trimesh.Trimesh(vertices, faces, process=False)
+    trimesh.repair.fix_winding(solid)
+    turned = np.asarray(solid.faces, dtype=np.int64)
     note(int((turned != faces).any(axis=1).sum()), "faces turned to agree with their neighbours")
-    vertices, faces, again, cuts = cut_open(vertices, turned, against(turned))
-    note(cuts, "edges cut open where the faces can't agree")
-    origin = origin[again]
+    inconsistent = _multiplicity(directed_edges(turned)) > 1
+    vertices, faces, copied, cuts = _cut_open(vertices, turned, inconsistent)
+    note(cuts, "edges cut open where faces cannot be turned to agree")
+    origin = origin[copied]
 
     used, faces = in_use(faces)
-    became = np.full(len(place) + 1, -1)
-    became[origin[used][::-1]] = np.arange(len(used))[::-1]  # of the copies of a vertex the first
+    new_index = np.full(len(joined) + 1, -1)  # the last element is that of index -1
+    new_index[origin[used][::-1]] = np.arange(len(used))[::-1]  # the first copy of a vertex counts
     mesh = Mesh(vertices[used], faces, name)
-    return Repaired(mesh, became[place], origin[used], changes)
+    return Repaired(mesh, new_index[np.where(finite, joined, -1)], origin[used], changes)
 
 
 def outwards(mesh: Mesh) -> tuple[Mesh, int]:
-    """The mesh with those of its pieces turned that are inside out, and how many these are.
+    """Turn the pieces of a mesh that are inside out.
 
-    A piece is what edges hold together. It is inside out if the volume that it encloses with its
-    own centre is negative; where the piece has a boundary, clearly so: by more than CLEARLY of the
-    volume of a sphere with its area.
+    A piece is a set of faces connected by edges. It is inside out if the signed volume between its
+    surface and its centroid is negative. If the piece has a boundary, the volume must be clearly
+    negative: by more than CLEARLY of the volume of a sphere with the area of the piece.
+
+    Args:
+        mesh: The surface.
+
+    Returns:
+        The mesh with the faces of these pieces reversed, and the number of these pieces.
     """
     solid = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
     pairs = solid.face_adjacency
@@ -119,9 +144,25 @@ def outwards(mesh: Mesh) -> tuple[Mesh, int]:
     return Mesh(mesh.vertices, faces, mesh.name), int(inside_out.sum())
 
 
-def closed(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """The faces, and behind them others that close the small holes."""
-    import pyvista  # takes a second
+def _joined(vertices: np.ndarray, finite: np.ndarray) -> np.ndarray:
+    """For every vertex the first one at equal coordinates, int64 [V]; itself if it is not finite.
+
+    Args:
+        vertices: float64 [V, 3].
+        finite: bool [V], whether the coordinates of each vertex are finite.
+    """
+    sound = np.flatnonzero(finite)
+    _, first, inverse = np.unique(
+        vertices[sound] + 0.0, axis=0, return_index=True, return_inverse=True
+    )  # + 0.0 makes -0.0 equal to 0.0
+    joined = np.arange(len(vertices))
+    joined[sound] = sound[first[inverse.reshape(-1)]]
+    return joined
+
+
+def _fill_holes(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """The faces, followed by faces that close the holes no larger than HOLE."""
+    import pyvista  # slow to import: one second
 
     corners = vertices[faces]
     with np.errstate(over="ignore", invalid="ignore"):
@@ -133,56 +174,58 @@ def closed(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     filled = surface.triangulate().regular_faces.astype(np.int64)
     filled[len(faces) :] = filled[len(faces) :, ::-1]  # VTK winds them along the boundary
     filled = without_repeats(filled)
-    third = crowded(filled).any(axis=1)
-    third[: len(faces)] = False
-    return filled[~third]
+    refused = (_multiplicity(np.sort(directed_edges(filled), axis=1)) > 2).any(axis=1)
+    refused[: len(faces)] = False  # only new faces at edges with more than two faces
+    return filled[~refused]
 
 
-def crowded(faces: np.ndarray) -> np.ndarray:
-    """bool [F, 3]: whether the edge from corner k to the next has more than two faces."""
-    _, number, count = np.unique(
-        np.sort(edges(faces), axis=1), axis=0, return_inverse=True, return_counts=True
-    )
-    return (count > 2)[number.reshape(-1)].reshape(-1, 3)
+def _multiplicity(edges: np.ndarray) -> np.ndarray:
+    """How often the edge from every corner of a face to the next occurs.
+
+    Args:
+        edges: int [3 F, 2], in the order of `directed_edges`; sorted along axis 1, both directions
+            of an edge count as one.
+
+    Returns:
+        int64 [F, 3].
+    """
+    _, number, count = np.unique(edges, axis=0, return_inverse=True, return_counts=True)
+    return count[number.reshape(-1)].reshape(-1, 3)
 
 
-def against(faces: np.ndarray) -> np.ndarray:
-    """bool [F, 3]: whether the edge from corner k to the next has two faces in that direction."""
-    _, number, count = np.unique(edges(faces), axis=0, return_inverse=True, return_counts=True)
-    return (count > 1)[number.reshape(-1)].reshape(-1, 3)
-
-
-def edges(faces: np.ndarray) -> np.ndarray:
-    """[3 F, 2]: those of each face, in its direction."""
-    return faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
-
-
-def cut_open(
+def _cut_open(
     vertices: np.ndarray, faces: np.ndarray, along: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, int]:
-    """Separates the faces at some of their edges: vertices [W, 3], faces [F, 3], for each of the W
-    vertices the one it is a copy of, and the number of edges.
+    """Separate faces along edges, by copies of their vertices.
 
-    along: bool [F, 3], edges from corner k to the next. Corners of faces stay one vertex where a
-    path over the other edges joins them.
+    Corners of faces remain one vertex where a path over the other edges connects them.
+
+    Args:
+        vertices: float64 [V, 3].
+        faces: int64 [F, 3].
+        along: bool [F, 3], whether to cut the edge from each corner to the next.
+
+    Returns:
+        The vertices, [W, 3]; the faces, [F, 3]; for each of the W vertices the one that it is a
+        copy of, int64 [W]; and the number of edges cut.
     """
     if not along.any():
         return vertices, faces, np.arange(len(vertices)), 0
-    pairs = edges(faces)
-    undirected = np.sort(pairs, axis=1)
-    flat = along.ravel()
+    edges = directed_edges(faces)
+    undirected = np.sort(edges, axis=1)
+    cut = along.ravel()
     # edge e of face f has corners 3 f + e and 3 f + (e + 1) % 3
-    begin = np.arange(len(pairs))
+    begin = np.arange(len(edges))
     end = begin - begin % 3 + (begin + 1) % 3
-    low = np.where(pairs[:, 0] < pairs[:, 1], begin, end)
+    low = np.where(edges[:, 0] < edges[:, 1], begin, end)  # the corner with the smaller vertex
     high = begin + end - low
     key = undirected[:, 0] * len(vertices) + undirected[:, 1]
-    order = np.argsort(key[~flat], kind="stable")
-    open_ = np.flatnonzero(~flat)[order]
-    same = key[open_[1:]] == key[open_[:-1]]
-    one, two = open_[:-1][same], open_[1:][same]
+    order = np.argsort(key[~cut], kind="stable")
+    uncut = np.flatnonzero(~cut)[order]
+    same = key[uncut[1:]] == key[uncut[:-1]]
+    one, two = uncut[:-1][same], uncut[1:][same]
     rows, columns = np.concatenate([low[one], high[one]]), np.concatenate([low[two], high[two]])
-    graph = coo_array((np.ones(len(rows)), (rows, columns)), shape=(len(pairs), len(pairs)))
+    graph = coo_array((np.ones(len(rows)), (rows, columns)), shape=(len(edges), len(edges)))
     count, number = connected_components(graph, directed=False)
     origin = np.empty(count, dtype=np.int64)
     origin[number] = faces.ravel()
@@ -190,5 +233,5 @@ def cut_open(
         vertices[origin],
         number.reshape(-1, 3).astype(np.int64),
         origin,
-        len(np.unique(key[flat])),
+        len(np.unique(key[cut])),
     )

@@ -1,14 +1,15 @@
-"""SHOT: signatures of histograms of orientations, a local descriptor of a surface at its vertices.
+"""SHOT (signatures of histograms of orientations): a local descriptor of a surface at its vertices.
 
 Salti, Tombari, Di Stefano, "SHOT: Unique signatures of histograms for surface and texture
-description", Computer Vision and Image Understanding 125 (2014). The paper leaves much open; what
-is computed here is the algorithm of the Point Cloud Library (PCL) 1.13, to within 1e-5.
+description", Computer Vision and Image Understanding 125 (2014). The paper leaves many details
+open. This module computes what the Point Cloud Library (PCL) 1.13 computes, to within 1e-5.
 
-Descriptors published for FAUST were made with a unit-dependent variant (weights R - d^2 in the
-local frame, an azimuth modulus of 28) and cannot be reproduced exactly; that variant is not here.
+Descriptors published for FAUST were made with a variant that depends on the unit of length (weights
+R - d^2 in the local frame, an azimuth modulus of 28). They cannot be reproduced exactly; the
+variant is not implemented here.
 
-Votes jump where a neighbour crosses the border of a cell of the histogram, and axes flip where the
-votes on their signs tie. Rounding alone therefore changes some rows, under 1 %, of a rotated mesh.
+Votes jump where a neighbour crosses the border of a histogram cell, and axes flip where the votes
+on their signs tie. Rounding alone therefore changes some rows, less than 1 %, of a rotated mesh.
 """
 
 from __future__ import annotations
@@ -20,9 +21,9 @@ from numba import njit
 
 from meshspiral.geometry.angles import arccos, eighth
 
-SECTORS = 32  # 8 of azimuth x 2 of radius x 2 of elevation
-LEAST_NEIGHBOURS = 5  # away from the centre; with fewer there is no local frame
-MOST_CELLS = 2**21 - 3  # along an axis of the search grid, so that three indices fit an int64
+SECTORS = 32  # 8 in azimuth x 2 in radius x 2 in elevation
+LEAST_NEIGHBOURS = 5  # with fewer, not counting points at the centre, there is no local frame
+MOST_CELLS = 2**21 - 3  # along an axis of the search grid: three indices fit into an int64
 
 
 def shot_descriptors(
@@ -32,48 +33,62 @@ def shot_descriptors(
     bins: int = 16,
     pcl_cosine_wrap: bool = False,
 ) -> np.ndarray:
-    """SHOT descriptor of every vertex: float32 [V, 32 * (bins + 1)], rows of unit L2 norm.
-
-    vertices: float [V, 3], any unit of length; rounded to float32, as in PCL, so a mesh should not
-    lie farther from the origin than some multiples of its size. normals: float [V, 3], unit
-    length. radius: of the support and of the local frame, in the unit of the vertices; usual is
-    0.06 * sqrt(surface area). bins: steps of the cosine between a neighbour's normal and
-    the z axis; 16 gives 544 dimensions, 10 gives 352. pcl_cosine_wrap: PCL lets the cosine votes
-    of bin `bins - 1` towards bin `bins` go to bin 0, a slip that the authors' own code has
-    corrected; True repeats it, to compare with values from PCL.
+    """The SHOT descriptor of every vertex (Salti, Tombari, Di Stefano 2014).
 
     Column: (4 * azimuth + 2 * outer + upper) * (bins + 1) + bin.
 
-    A row is NaN where the descriptor is undefined: fewer than five neighbours at other coordinates
-    than the vertex's own and nearer than the radius, no such neighbour with a finite normal, or
-    coordinates that are not finite. A vertex with such coordinates is nobody's neighbour. A vertex
-    whose normal is not finite counts in the local frames but casts no votes; a normal of zero
-    length votes as one perpendicular to z.
+    Renumbering the vertices permutes the rows. Sums, and ties of distance, follow the order of the
+    coordinates, where PCL follows the numbers of the vertices. Two exceptions remain: sums over
+    points at equal coordinates follow the numbers, within float64 rounding; and a mesh with exact
+    ties, such as an undeformed icosphere, has rows that depend on its orientation.
 
-    Renumbering the vertices permutes the rows: sums and ties of distance follow the order of
-    coordinates, where PCL follows the numbers of the vertices. Two things remain: sums over points
-    at equal coordinates follow the numbers, within float64 rounding; and a mesh with exact ties,
-    such as a plain icosphere, depends on how it is turned.
+    Args:
+        vertices: float [V, 3], in any unit of length. They are rounded to float32, as in PCL, so
+            the distance of a mesh from the origin should be at most a few times its size. A vertex
+            with coordinates that are not finite is nobody's neighbour.
+        normals: float [V, 3], of unit length. A vertex whose normal is not finite counts in the
+            local frames but casts no votes. A normal of zero length votes like one perpendicular to
+            the z axis.
+        radius: Of the support and of the local frame, in the unit of the vertices; usually
+            0.06 * sqrt(surface area).
+        bins: Steps of the cosine between a neighbour's normal and the z axis. 16 gives 544
+            dimensions, 10 gives 352.
+        pcl_cosine_wrap: Repeat an error of PCL, to compare with its values: cosine votes of bin
+            `bins - 1` towards bin `bins` go to bin 0. The authors' own code has corrected it.
 
-    Errors: ValueError for other shapes, bins < 1, and a radius that is not positive and finite, or
-    whose square is not, in float32.
+    Returns:
+        float32 [V, 32 * (bins + 1)], rows of unit L2 norm. A row is NaN where the descriptor is
+        undefined: the vertex's coordinates are not finite; fewer than five vertices are nearer than
+        the radius and at other coordinates than the vertex; or none of these has a finite normal.
+
+    Raises:
+        ValueError: An array has another shape; `bins` is not an integer or below 1; or `radius`, or
+            its square in float32, is not positive and finite.
     """
     vertices, normals = np.asarray(vertices), np.asarray(normals)
     if vertices.ndim != 2 or vertices.shape[1] != 3:
         raise ValueError(f"vertices must be [V, 3], got {vertices.shape}")
     if normals.shape != vertices.shape:
-        raise ValueError(f"normals must be {vertices.shape}, as the vertices, got {normals.shape}")
+        raise ValueError(
+            f"normals must be {vertices.shape}, like the vertices, got {normals.shape}"
+        )
     if not isinstance(bins, (int, np.integer)) or bins < 1:
         raise ValueError(f"bins must be an integer of at least 1, got {bins}")
     with np.errstate(over="ignore", under="ignore"):
         square = np.float32(float(radius) * float(radius))
     if not (radius > 0 and 0 < square < np.inf):
-        raise ValueError(f"radius must be positive and finite, also its square, got {radius}")
+        raise ValueError(
+            f"radius must be positive and finite, and so must its float32 square, got {radius}"
+        )
     return _descriptors_and_frames(vertices, normals, radius, bins, pcl_cosine_wrap)[0]
 
 
 def _descriptors_and_frames(vertices, normals, radius, bins, pcl_cosine_wrap):
-    """The descriptors, and the local frames: float32 [V, 3, 3], rows x, y, z, or NaN."""
+    """The descriptors of `shot_descriptors`, and the local frames.
+
+    Returns:
+        The descriptors; and the frames, float32 [V, 3, 3], with rows x, y, z, NaN where undefined.
+    """
     rows = np.full((len(vertices), SECTORS * (int(bins) + 1)), np.nan, dtype=np.float32)
     frames = np.full((len(vertices), 3, 3), np.nan, dtype=np.float32)
     with np.errstate(over="ignore"):
@@ -101,8 +116,16 @@ def _descriptors_and_frames(vertices, normals, radius, bins, pcl_cosine_wrap):
 
 
 def _cell_keys(points: np.ndarray, radius: float) -> np.ndarray:
-    """int64 [N]: the cell of a grid of edge `radius` each point is in, 21 bits for an axis."""
-    # a hair wider than the radius, since a rounded distance can fall below it
+    """The cell of every point in a cubic grid.
+
+    Args:
+        points: float32 [N, 3].
+        radius: The edge of the cells.
+
+    Returns:
+        int64 [N], the indices of the cell along x, y and z in 21 bits each.
+    """
+    # slightly wider than the radius, since a rounded distance can fall below it
     steps = (points - points.min(0).astype(np.float64)) / (radius * (1 + 1e-6))
     # points beyond the last cell share it: slower, but neighbours stay in adjacent cells
     x, y, z = (1 + np.minimum(steps, MOST_CELLS).astype(np.int64)).T
@@ -110,8 +133,15 @@ def _cell_keys(points: np.ndarray, radius: float) -> np.ndarray:
 
 
 def _candidate_ranges(keys: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """For ascending keys [N]: each point's cell, int64 [N], and the points in the 27 cells around
-    each of the C cells in use, as nine ascending ranges [start, stop): int64 [C, 9, 2]."""
+    """The points in the 27 cells around every cell in use.
+
+    Args:
+        keys: int64 [N], ascending, as `_cell_keys` returns them.
+
+    Returns:
+        The cell of every point, int64 [N], counting the C cells in use from 0; and for every such
+        cell the points in the 27 cells, as nine ascending ranges [start, stop), int64 [C, 9, 2].
+    """
     used, cells = np.unique(keys, return_inverse=True)
     steps = np.array([(i << 42) + (j << 21) for i in (-1, 0, 1) for j in (-1, 0, 1)])
     columns = used[:, None] + steps
@@ -122,9 +152,15 @@ def _candidate_ranges(keys: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 @njit(cache=True, error_model="numpy")
 def _kernel(points, normals, cells, ranges, order, radius, bins, wrap, rows, frames):
-    """Fill rows [V, 32 * (bins + 1)] and frames [V, 3, 3] at `order`.
+    """Compute the descriptors and local frames of all usable points.
 
-    points, normals: float32 [3, N], sorted by cell. The others as in the functions above.
+    Args:
+        points, normals: float32 [3, N], sorted by cell.
+        cells, ranges: As `_candidate_ranges` returns them.
+        order: int64 [N], the vertex of every point.
+        radius, bins, wrap: As in `shot_descriptors`.
+        rows: float32 [V, 32 * (bins + 1)], written.
+        frames: float32 [V, 3, 3], written.
     """
     n = points.shape[1]
     index, square = np.empty(n + 1, np.int64), np.empty(n + 1, np.float32)
@@ -137,7 +173,7 @@ def _kernel(points, normals, cells, ranges, order, radius, bins, wrap, rows, fra
         if m < LEAST_NEIGHBOURS:
             continue
         for k in range(m):
-            # in float32, as PCL: where axes are nearly tied, more digits here turn them by 1e-5
+            # in float32, like PCL: where axes are nearly tied, more digits rotate them by 1e-5
             distance[k] = np.sqrt(square[k])
             for axis in range(3):
                 offset[axis, k] = points[axis, index[k]] - points[axis, i]
@@ -155,7 +191,19 @@ def _kernel(points, normals, cells, ranges, order, radius, bins, wrap, rows, fra
 
 @njit(cache=True, error_model="numpy")
 def _neighbours(points, i, ranges, limit, index, square):
-    """List the points k with 0 < |p_k - p_i|^2 < limit, ascending; return their number."""
+    """Find the points k with 0 < |p_k - p_i|^2 < limit, in ascending order.
+
+    Args:
+        points: float32 [3, N].
+        i: The centre.
+        ranges: int64 [9, 2], the candidates.
+        limit: float32, the squared radius.
+        index: int64 [N+1], receives the points.
+        square: float32 [N+1], receives their squared distances.
+
+    Returns:
+        The number of points found.
+    """
     m = 0
     for r in range(len(ranges)):
         for k in range(ranges[r, 0], ranges[r, 1]):
@@ -163,7 +211,7 @@ def _neighbours(points, i, ranges, limit, index, square):
             y = points[1, k] - points[1, i]
             z = points[2, k] - points[2, i]
             d2 = x * x + y * y + z * z
-            index[m] = k  # always written, kept by the count: cheaper than a branch
+            index[m] = k  # written always, counted only if near: cheaper than a branch
             square[m] = d2
             m += (d2 > 0) & (d2 < limit)
     return m
@@ -171,9 +219,18 @@ def _neighbours(points, i, ranges, limit, index, square):
 
 @njit(cache=True, error_model="numpy")
 def _local_frame(offset, distance, square, m, radius, frame):
-    """Write the axes x, y, z of the m neighbours' weighted covariance to frame, float32 [3, 3].
+    """Write the local frame: the axes of the neighbours' weighted covariance.
 
-    x is the eigenvector of the largest eigenvalue, z of the smallest; y = z x x.
+    x is the eigenvector of the largest eigenvalue, z that of the smallest, and y their cross
+    product z x x.
+
+    Args:
+        offset: float32 [3, N], the neighbours relative to the centre.
+        distance: float64 [N], their distances.
+        square: float32 [N], their squared distances.
+        m: Number of neighbours.
+        radius: Neighbours weigh radius - distance.
+        frame: float32 [3, 3], receives the axes as rows.
     """
     xx = xy = xz = yy = yz = zz = total = 0.0
     for k in range(m):
@@ -186,7 +243,7 @@ def _local_frame(offset, distance, square, m, radius, frame):
         yy += w * y * y
         yz += w * y * z
         zz += w * z * z
-    if total == 0:  # every neighbour at the radius itself, as rounded: the axes stay NaN
+    if total == 0:  # all distances round to the radius: the axes stay NaN
         return
     matrix = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]) / total
     vectors = _eigenvectors(matrix)
@@ -206,9 +263,13 @@ def _local_frame(offset, distance, square, m, radius, frame):
 
 @njit(cache=True, error_model="numpy")
 def _eigenvectors(a):
-    """Unit eigenvectors, the columns of float64 [3, 3], of the symmetric a, by Jacobi's method.
+    """The eigenvectors of a symmetric matrix by Jacobi's method, without SciPy as numba's own has.
 
-    a is overwritten; its diagonal becomes the eigenvalues. (numba's own needs SciPy.)
+    Args:
+        a: float64 [3, 3], overwritten; its diagonal becomes the eigenvalues.
+
+    Returns:
+        float64 [3, 3], the unit eigenvectors as columns.
     """
     v = np.eye(3)
     for _ in range(20):
@@ -235,7 +296,7 @@ def _eigenvectors(a):
 def _points_along(offset, square, m, a, b, c):
     """Whether most of the m neighbours lie on the side that the axis (a, b, c) points to.
 
-    A draw goes to the majority of the five neighbours about the median distance.
+    A tie is decided by the majority of the five neighbours around the median distance.
     """
     count = 0
     for k in range(m):
@@ -251,11 +312,19 @@ def _points_along(offset, square, m, a, b, c):
 
 @njit(cache=True, error_model="numpy")
 def _vote(offset, distance, normals, index, m, frame, radius, bins, wrap, histogram):
-    """Fill the histogram, float64 [32 * (bins + 1)], from the m neighbours, before scaling.
+    """Fill the histogram from the m neighbours, before normalisation.
 
-    A neighbour falls into one cell and, in each of four coordinates, lies at some share e of a
-    cell's width from that cell's centre: the cell gets 1 - |e|, the next one on that side |e|,
-    where there is one.
+    A neighbour falls into one cell. In each of four coordinates (cosine, radius, elevation,
+    azimuth) it lies e cell widths from the centre of that cell. The cell gets 1 - |e|, and the next
+    cell on that side gets |e|, if there is one.
+
+    Args:
+        offset, distance, m, radius: As in `_local_frame`.
+        normals: float32 [3, N].
+        index: int64 [N+1], the neighbours.
+        frame: float32 [3, 3], the local frame.
+        bins, wrap: As in `shot_descriptors`.
+        histogram: float64 [32 * (bins + 1)], written.
     """
     histogram[:] = 0.0
     for k in range(m):
@@ -269,14 +338,14 @@ def _vote(offset, distance, normals, index, m, frame, radius, bins, wrap, histog
         y = dx * frame[1, 0] + dy * frame[1, 1] + dz * frame[1, 2]
         z = dx * frame[2, 0] + dy * frame[2, 1] + dz * frame[2, 2]
 
-        place = (1 + min(max(cosine, -1.0), 1.0)) * bins / 2
-        bin_ = int(place + 0.5)
-        azimuth, turned = eighth(x, y)
+        position = (1 + min(max(cosine, -1.0), 1.0)) * bins / 2
+        bin_ = int(position + 0.5)
+        azimuth, azimuth_offset = eighth(x, y)
         outer, upper = int(d > radius / 2), int(z > 0)
         sector = 4 * azimuth + 2 * outer + upper
         cell = sector * (bins + 1) + bin_
 
-        e = place - bin_
+        e = position - bin_
         weight = 1 - abs(e)
         if e > 0:
             histogram[cell - bin_ if wrap and bin_ == bins - 1 else cell + 1] += e
@@ -292,7 +361,7 @@ def _vote(offset, distance, normals, index, m, frame, radius, bins, wrap, histog
         histogram[(sector ^ 1) * (bins + 1) + bin_] += max(e if upper else -e, 0.0)
 
         if x != 0 or y != 0:
-            weight += 1 - abs(turned)
-            beside = (sector + (4 if turned > 0 else -4)) % SECTORS
-            histogram[beside * (bins + 1) + bin_] += abs(turned)
+            weight += 1 - abs(azimuth_offset)
+            beside = (sector + (4 if azimuth_offset > 0 else -4)) % SECTORS
+            histogram[beside * (bins + 1) + bin_] += abs(azimuth_offset)
         histogram[cell] += weight

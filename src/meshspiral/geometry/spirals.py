@@ -1,13 +1,14 @@
-"""The spiral operator (Lim, Dielen, Campen, Kobbelt 2018, section 3.1).
+"""Spirals around vertices (Lim, Dielen, Campen, Kobbelt 2018, section 3.1).
 
-A spiral writes out the neighbourhood of a vertex v: v itself, its one-ring clockwise, its two-ring,
-and so on. With the k-ring of v, 0-ring = {v}, (k+1)-ring = N(k-ring) without the k-disk:
+A spiral orders the neighbourhood of a vertex v into a sequence: v itself, its one-ring clockwise,
+its two-ring, and so on. The 0-ring of v is {v}; the (k+1)-ring is the set of neighbours of the
+k-ring outside the k-disk.
 
-- the one-ring is clockwise, from a start that is free;
-- of two vertices of the (k+1)-ring that share a neighbour in the k-ring, the one that comes first
-  clockwise around it comes first; if they share none, they keep the order of their neighbours.
+- The one-ring is clockwise, from a start that may be any neighbour.
+- Two vertices of the (k+1)-ring with a common neighbour in the k-ring stand in their clockwise
+  order around it. Two without a common neighbour stand in the order of their neighbours.
 
-It ends after exactly N vertices, or with the k-th ring.
+A spiral ends after exactly N vertices, or with the k-th ring.
 """
 
 from __future__ import annotations
@@ -23,13 +24,14 @@ from meshspiral.geometry.mesh import Mesh
 
 @dataclass(frozen=True, eq=False)
 class SpiralTable:
-    """The spirals of all starts of all vertices of a mesh.
+    """The spirals of all vertices of a mesh, from all starts.
 
-    sequences: int32 [R, N], vertex indices, -1 where the component has no more vertices.
-    first: int64 [V+1]; the rows of vertex v are first[v]:first[v+1], one per start, clockwise.
+    A spiral is determined by its first step, so the table has one row per directed edge. An
+    isolated vertex v has the single row [v, -1, ...].
 
-    A spiral depends on nothing but its first step, so there is one row for each directed edge;
-    a vertex without neighbours has the one row [v, -1, ...].
+    Attributes:
+        sequences: int32 [R, N], vertex indices; -1 after the last vertex of a spiral.
+        first: int64 [V+1]; the rows of vertex v are first[v]:first[v+1], one per start, clockwise.
     """
 
     sequences: np.ndarray
@@ -37,20 +39,29 @@ class SpiralTable:
 
 
 def spiral_table(mesh: Mesh, length: int | None = None, *, rings: int | None = None) -> SpiralTable:
-    """Every spiral of a mesh, of `length` vertices or of `rings` whole rings.
+    """All spirals of a mesh, one per vertex and start (Lim et al. 2018, section 3.1).
 
-    With `length` N the table is [R, N]. With `rings` k the spirals differ in length; the table is
-    as wide as the longest and padded with -1.
+    The one-ring of a boundary vertex is an open fan; a spiral that starts inside the fan continues
+    at its other end. The fans of a bow tie follow one another as in `one_rings`. Rings that are
+    incomplete, fall into pieces or meet themselves list every vertex once.
 
-    At a boundary vertex the ring is an open fan: a start inside the fan goes on over the gap. Rings
-    that are partial, fall into pieces or meet themselves list each vertex once. Where several fans
-    meet in one vertex, they follow one another as in `one_rings`. The sequences do not depend on
-    the numbering of the mesh; only where the rows of a vertex begin does.
+    Args:
+        mesh: The surface; boundaries, bow ties and several components are allowed.
+        length: Number of vertices N of every spiral. Give either this or `rings`.
+        rings: Number of complete rings k; the spirals then differ in length, and N is the longest.
 
-    Errors: ValueError unless exactly one of length >= 1 and rings >= 0 is given.
+    Returns:
+        The table. Spirals are padded with -1, also where a component has fewer than N vertices. The
+        sequences do not depend on the numbering of the mesh; which row of a vertex comes first
+        does.
+
+    Raises:
+        ValueError: Neither or both of `length` and `rings` are given, `length` is below 1, or
+            `rings` is below 0.
     """
     if (length is None) == (rings is None):
-        raise ValueError("give either length or rings, not both and not neither")
+        given = "neither" if length is None else f"length={length} and rings={rings}"
+        raise ValueError(f"give either length or rings, got {given}")
     if length is not None and length < 1:
         raise ValueError(f"length must be at least 1, got {length}")
     if rings is not None and rings < 0:
@@ -60,19 +71,34 @@ def spiral_table(mesh: Mesh, length: int | None = None, *, rings: int | None = N
     np.cumsum(np.maximum(np.diff(ring_first), 1), out=rows_first[1:])
     if length is None:
         length = _longest(neighbours, ring_first, rings)
-    depth = np.iinfo(np.int32).max if rings is None else rings
+    max_depth = np.iinfo(np.int32).max if rings is None else rings
     sequences = np.full((rows_first[-1], length), -1, dtype=np.int32)
-    _fill(neighbours, ring_first, rows_first, depth, sequences)
+    _fill(neighbours, ring_first, rows_first, max_depth, sequences)
     return SpiralTable(sequences, rows_first)
 
 
 @njit(cache=True)
 def _spiral(v, start, neighbours, first, max_depth, seen, mark, out, parent, depth):
-    """Write the spiral of v whose first step is its neighbour number `start`; return its length.
+    """Write one spiral.
 
-    The sequence is walked as a queue. Vertex u, with w before it, appends its unseen neighbours
-    clockwise from just after w: where the rings are whole, each step then leads to a neighbour.
-    If w is no neighbour of u, it begins after the vertex that appended u, which always is one.
+    The sequence is processed as a queue. Vertex u, with w before it in the sequence, appends its
+    unseen neighbours clockwise from just after w: where the rings are complete, every step then
+    leads to a neighbour. If w is not a neighbour of u, it begins after the vertex that appended u,
+    which always is one.
+
+    Args:
+        v: The centre.
+        start: Position in v's one-ring of the first step.
+        neighbours, first: The one-rings, as `one_rings` returns them.
+        max_depth: Number of rings.
+        seen: int64 [V], a mark for every vertex; this spiral sets those of its vertices to `mark`.
+        mark: A number that no spiral before has used.
+        out: int32 [N], receives the spiral.
+        parent: int32 [N], receives the position of the vertex that appended each.
+        depth: int32 [N], receives the ring of each.
+
+    Returns:
+        The number of vertices written.
     """
     out[0], parent[0], depth[0] = v, 0, 0
     seen[v] = mark
@@ -101,23 +127,14 @@ def _spiral(v, start, neighbours, first, max_depth, seen, mark, out, parent, dep
 
 @njit(cache=True)
 def _fill(neighbours, first, rows_first, max_depth, sequences):
+    """Write the spirals of all vertices into sequences, int32 [R, N]."""
     length = sequences.shape[1]
     seen = np.full(len(first) - 1, -1, np.int64)
     parent, depth = np.empty(length, np.int32), np.empty(length, np.int32)
     for v in range(len(first) - 1):
         for row in range(rows_first[v], rows_first[v + 1]):
-            _spiral(
-                v,
-                row - rows_first[v],
-                neighbours,
-                first,
-                max_depth,
-                seen,
-                row,
-                sequences[row],
-                parent,
-                depth,
-            )
+            start, out = row - rows_first[v], sequences[row]
+            _spiral(v, start, neighbours, first, max_depth, seen, row, out, parent, depth)
 
 
 @njit(cache=True)
@@ -125,11 +142,8 @@ def _longest(neighbours, first, rings):
     """The largest number of vertices within `rings` rings of any vertex."""
     count = len(first) - 1
     seen = np.full(count, -1, np.int64)
-    out, parent, depth = (
-        np.empty(count, np.int32),
-        np.empty(count, np.int32),
-        np.empty(count, np.int32),
-    )
+    out = np.empty(count, np.int32)
+    parent, depth = np.empty_like(out), np.empty_like(out)
     longest = 1
     for v in range(count):
         end = _spiral(v, 0, neighbours, first, rings, seen, v, out, parent, depth)

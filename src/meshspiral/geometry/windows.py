@@ -1,14 +1,15 @@
 """Gaussian windows on geodesic polar patches (Masci, Boscaini, Bronstein, Vandergheynst 2015).
 
-Here the cells of the polar grid around a vertex are not points, as in `geodesic_patches`, but
-weighted means of the vertices around: Gaussians in distance and angle, times the vertices' areas.
+In `geodesic_patches` a cell of the polar grid around a vertex is a point. Here it is a weighted
+mean of the vertices around: a Gaussian in distance and in angle, times the areas of the vertices.
 The formulae are those of the authors' published code, with its factors 2 for the rings and 0.01 for
-the rays; but a patch ends at the radius, and distances to the rays follow from the coordinates.
+the rays. Two things differ: a patch ends at the radius, and distances to the rays are computed from
+the polar coordinates.
 
-These are discrete geodesic polar coordinates (Melvaer, Reimers 2012): a front grows from the vertex
-as in Dijkstra's algorithm, but across faces. Two corners of a face are laid into the plane together
-with the source that their distances belong to, and the third corner is measured from there. Where
-the surface is flat that is exact.
+The polar coordinates are discrete geodesic polar coordinates (Melvaer, Reimers 2012). A front grows
+from the vertex as in Dijkstra's algorithm, but across faces: two corners of a face are unfolded
+into the plane together with the source of their distances, and the third corner is measured from
+there. Where the surface is flat that is exact.
 """
 
 from __future__ import annotations
@@ -21,19 +22,23 @@ from numba import njit
 
 from meshspiral.geometry.connectivity import one_rings
 from meshspiral.geometry.mesh import Mesh
-from meshspiral.geometry.patches import _coordinates, _directions, _left, check_grid
+from meshspiral.geometry.patches import check_grid, edge_coordinates, face_sectors, left_corners
 
-LEAST_SHARE = 0.01  # of a row's largest weight; what is below is dropped
-CLOSER = 1 - 1e-10  # a distance gives way only to one that is less by more than rounding
-MOST_TURNS = 100  # that a vertex is taken up; needles far longer than a thousand widths reach it
+LEAST_SHARE = 0.01  # of a row's largest weight; smaller weights are dropped
+CLOSER = 1 - 1e-10  # a distance is replaced only by one that is smaller by more than rounding
+MOST_TURNS = 100  # times a vertex is processed; needles far longer than 1000 widths reach this
 
 
 class WindowTable(NamedTuple):
-    """The weighted sums in sparse rows: sample s = (v * rings + i) * rays + j is the sum over k in
-    first[s]:first[s+1] of weights[k] * f[indices[k]], for any values f of the vertices.
+    """The samples of every vertex's grid, as sparse rows of weights.
 
-    indices: int32 [E]. weights: float32 [E], none negative, of sum 1 in each row.
-    first: int64 [V * rings * rays + 1]. The rows of a vertex without a face are empty.
+    For values f of the vertices, sample s = (v * rings + i) * rays + j is the sum over k in
+    first[s]:first[s+1] of weights[k] * f[indices[k]]. The rows of an isolated vertex are empty.
+
+    Attributes:
+        indices: int32 [E], vertices.
+        weights: float32 [E], non-negative, with sum 1 in every row.
+        first: int64 [V * rings * rays + 1], the start of every row.
     """
 
     indices: np.ndarray
@@ -44,77 +49,99 @@ class WindowTable(NamedTuple):
 def gaussian_windows(
     mesh: Mesh, radius: float, rings: int = 5, rays: int = 16, turn: np.ndarray | None = None
 ) -> WindowTable:
-    """The windows of every vertex over the vertices up to geodesic distance `radius`, itself too.
+    """The Gaussian windows of all vertices, each over the vertices within a geodesic radius.
 
-    In cell (i, j), from 0, vertex u at distance r and angle t has the weight
+    In cell (i, j), counted from 0, vertex u at distance r and angle t has the weight
 
         area(u) * ring_i(u) * ray_j(u),
         ring_0 = 1 / (1 + exp((r - m_0) / (2 m_0))),   m_i = (i + 1/2) * radius / rings,
         ring_i = exp(-((r - m_i) / (2 radius / rings))^2) for i > 0,
-        ray_j = exp(-(d / r)^2 / 0.01),
+        ray_j = exp(-(d / r)^2 / 0.01).
 
-    with d the distance to the ray at t_j = (j + 1/2) 2 pi / rays: r |sin(t - t_j)|, or r if t - t_j
-    is more than a right angle. Directions are those of `geodesic_patches`. For each u the rings are
-    divided by their sum, and so are the rays, which are all equal at r = 0. area(u) is a third of
-    the area of u's faces; in a patch without area all are equal. What is below a hundredth of a
-    row's largest weight is dropped, and the row divided by its sum.
+    Here d is the distance to the ray at t_j = (j + 1/2) 2 pi / rays: r |sin(t - t_j)|, or r if
+    t - t_j is more than a right angle. Directions are those of `geodesic_patches`. area(u) is a
+    third of the area of u's faces; in a patch without area all vertices count alike. The ring_i of
+    a vertex are divided by their sum, and so are its ray_j, which are all equal at r = 0. Weights
+    below 1 % of the largest of their row are dropped, and the rest is divided by its sum.
 
-    Renumbering the mesh renumbers rows and indices, but for the order within a row and the
-    arbitrary first direction; where two shortest ways are equally long, either may be taken.
+    Renumbering the mesh renumbers rows and indices, except for the order within a row and the
+    arbitrary first direction. Between two equally short paths the choice is arbitrary.
 
-    radius: in the mesh's unit. turn: float [V], radians by which the grid of each vertex is turned
-    counter-clockwise; None for none. Errors: ValueError for a radius that is not positive and
-    finite, or rings or rays below 1.
+    Args:
+        mesh: The surface.
+        radius: Geodesic distance up to which vertices count, in the mesh's unit.
+        rings: Number of rings.
+        rays: Number of rays.
+        turn: float [V], radians by which the grid of each vertex is turned counter-clockwise. None
+            for no turn.
+
+    Returns:
+        The table of V * rings * rays samples.
+
+    Raises:
+        ValueError: `radius` is not positive and finite, or `rings` or `rays` is below 1.
     """
     check_grid(radius, rings, rays)
     neighbours, first = one_rings(mesh)
-    for_numba = mesh.vertices, neighbours, first, _left(mesh.faces, neighbours, first)
+    surface = mesh.vertices, neighbours, first, left_corners(mesh.faces, neighbours, first)
     thirds = np.repeat(np.linalg.norm(mesh.face_normals, axis=1) / 6, 3)
     areas = np.bincount(mesh.faces.ravel(), thirds, len(mesh.vertices))
-    directions = _directions(*for_numba)
+    sectors = face_sectors(*surface)
     if turn is not None:
-        directions -= np.repeat(turn, np.diff(first))[:, None]
-    for_numba += directions, areas
-    return WindowTable(*_all_windows(*for_numba, float(radius), rings, rays))
+        sectors -= np.repeat(turn, np.diff(first))[:, None]
+    return WindowTable(*_all_windows(*surface, sectors, areas, float(radius), rings, rays))
 
 
 @njit(cache=True)
-def _all_windows(vertices, neighbours, first, left, directions, areas, radius, rings, rays):
-    """The arrays of a `WindowTable`. Weights are logarithms until a row is written: far from every
-    vertex they would all be 0."""
+def _all_windows(vertices, neighbours, first, left, sectors, areas, radius, rings, rays):
+    """The windows of all vertices.
+
+    Weights are logarithms until a row is written: far from every vertex they would all be 0.
+
+    Args:
+        vertices, neighbours, first, left, sectors: As in `face_sectors`.
+        areas: float64 [V], a third of the area of the faces of each vertex.
+        radius, rings, rays: As in `gaussian_windows`.
+
+    Returns:
+        The arrays of a `WindowTable`.
+    """
     count = len(first) - 1
     distance, angle = np.full(count, np.inf), np.zeros(count)
-    turns, disk = np.zeros(count, np.int32), np.empty(count, np.int32)
-    area, ring, ray = np.empty(count), np.empty((count, rings)), np.empty((count, rays))
+    updates, disk = np.zeros(count, np.int32), np.empty(count, np.int32)
+    log_area, log_ring, log_ray = np.empty(count), np.empty((count, rings)), np.empty((count, rays))
     indices, weights = np.empty(0, np.int32), np.empty(0, np.float32)
     row_first = np.zeros(count * rings * rays + 1, np.int64)
     row, end = 0, 0
     for v in range(count):
-        size = _polar(
-            v, vertices, neighbours, first, left, directions, radius, distance, angle, turns, disk
+        size = polar_coordinates(
+            v, vertices, neighbours, first, left, sectors, radius, distance, angle, updates, disk
         )
         most = end + size * rings * rays
         if most > len(indices):
             most += most // 2
-            indices, weights = _longer(indices, most, end), _longer(weights, most, end)
+            indices, weights = _resized(indices, most, end), _resized(weights, most, end)
         largest = 0.0
         for k in range(size):
             u = disk[k]
             largest = max(largest, areas[u])
-            _rings_and_rays(distance[u], angle[u], radius, ring[k], ray[k])
+            _rings_and_rays(distance[u], angle[u], radius, log_ring[k], log_ray[k])
             distance[u] = np.inf
         for k in range(size):
-            area[k] = np.log(areas[disk[k]]) if largest > 0 else 0.0
+            log_area[k] = np.log(areas[disk[k]]) if largest > 0 else 0.0
         for i in range(rings):
             for j in range(rays):
-                end = _write_row(disk[:size], area, ring[:, i], ray[:, j], end, indices, weights)
+                end = _write_row(
+                    disk[:size], log_area, log_ring[:, i], log_ray[:, j], end, indices, weights
+                )
                 row += 1
                 row_first[row] = end
-    return _longer(indices, end, end), _longer(weights, end, end), row_first
+    return _resized(indices, end, end), _resized(weights, end, end), row_first
 
 
 @njit(cache=True)
-def _longer(old, length, used):
+def _resized(old, length, used):
+    """An array of `length` elements that begins with the first `used` elements of `old`."""
     new = np.empty(length, old.dtype)
     for k in range(used):
         new[k] = old[k]
@@ -122,16 +149,16 @@ def _longer(old, length, used):
 
 
 @njit(cache=True)
-def _write_row(disk, area, ring, ray, end, indices, weights):
-    """Write the row of one cell from `end` on; return where it ends."""
+def _write_row(disk, log_area, log_ring, log_ray, end, indices, weights):
+    """Write the row of one cell to `indices` and `weights` from position `end`; return its end."""
     start, total, largest = end, 0.0, -np.inf
     for k in range(len(disk)):
-        largest = max(largest, area[k] + ring[k] + ray[k])
+        largest = max(largest, log_area[k] + log_ring[k] + log_ray[k])
     for k in range(len(disk)):
-        weight = area[k] + ring[k] + ray[k] - largest
-        if weight >= np.log(LEAST_SHARE):
-            indices[end], weights[end] = disk[k], np.exp(weight)
-            total += np.exp(weight)
+        log_weight = log_area[k] + log_ring[k] + log_ray[k] - largest
+        if log_weight >= np.log(LEAST_SHARE):
+            indices[end], weights[end] = disk[k], np.exp(log_weight)
+            total += np.exp(log_weight)
             end += 1
     for k in range(start, end):
         weights[k] /= total
@@ -139,17 +166,24 @@ def _write_row(disk, area, ring, ray, end, indices, weights):
 
 
 @njit(cache=True)
-def _rings_and_rays(r, t, radius, ring, ray):
-    """Write the logarithms of ring_i [rings] and ray_j [rays], each divided by their sum."""
-    step = radius / len(ring)
-    ring[0] = -np.logaddexp(0.0, (r - step / 2) / step)
-    for i in range(1, len(ring)):
-        ring[i] = -(((r - (i + 0.5) * step) / (2 * step)) ** 2)
-    for j in range(len(ray)):
-        off = _turn(t - (j + 0.5) * 2 * np.pi / len(ray))
-        d = np.sin(off) if abs(off) < np.pi / 2 else 1.0
-        ray[j] = -(d**2) / 0.01 if r > 0 else 0.0
-    for logs in (ring, ray):
+def _rings_and_rays(r, t, radius, log_ring, log_ray):
+    """Write the logarithms of the normalised ring_i and ray_j of a vertex.
+
+    Args:
+        r, t: Its distance and angle.
+        radius: Of the patch.
+        log_ring: float64 [rings], written.
+        log_ray: float64 [rays], written.
+    """
+    step = radius / len(log_ring)
+    log_ring[0] = -np.logaddexp(0.0, (r - step / 2) / step)
+    for i in range(1, len(log_ring)):
+        log_ring[i] = -(((r - (i + 0.5) * step) / (2 * step)) ** 2)
+    for j in range(len(log_ray)):
+        offset = _wrapped(t - (j + 0.5) * 2 * np.pi / len(log_ray))
+        d = np.sin(offset) if abs(offset) < np.pi / 2 else 1.0
+        log_ray[j] = -(d**2) / 0.01 if r > 0 else 0.0
+    for logs in (log_ring, log_ray):
         total = 0.0  # above 0: some ring is near, and a ray is exp(-100) at least
         for x in logs:
             total += np.exp(x)
@@ -158,57 +192,70 @@ def _rings_and_rays(r, t, radius, ring, ray):
 
 
 @njit(cache=True)
-def _turn(angle):
-    """The same direction as an angle of at most half a turn, either way."""
+def _wrapped(angle):
+    """The same direction as an angle from -pi to pi."""
     return angle - 2 * np.pi * np.round(angle / (2 * np.pi))
 
 
 @njit(cache=True)
-def _polar(v, vertices, neighbours, first, left, directions, radius, distance, angle, turns, disk):
-    """Write `distance` and `angle` around v of the vertices within the radius, and these into
-    `disk`; return their number, 0 where v has no face.
+def polar_coordinates(
+    v, vertices, neighbours, first, left, sectors, radius, distance, angle, updates, disk
+):
+    """Write the geodesic polar coordinates around v of all vertices within the radius.
 
-    distance: infinite when it comes, and afterwards at all other vertices. turns: 0, before and
-    after; twice how often the vertex has been taken up, and one more while it waits for that.
+    Behind obtuse corners a distance may decrease again. The vertex is then processed again, but
+    later: at once, long rows of needles would correct one another back and forth, in ever smaller
+    steps.
 
-    Behind obtuse corners a distance may fall again. The vertex is then taken up again, but later:
-    at once, long rows of needles would correct one another to and fro, in ever smaller steps.
+    Args:
+        v: The centre.
+        vertices, neighbours, first, left, sectors: As in `face_sectors`.
+        radius: The largest distance.
+        distance: float64 [V], all inf; receives distances within the radius.
+        angle: float64 [V]; receives angles in radians.
+        updates: int32 [V], all 0, and 0 again afterwards. In between: twice the number of times
+            that a vertex was processed, plus 1 while it waits in the front.
+        disk: int32 [V]; its beginning receives the vertices within the radius.
+
+    Returns:
+        The number of vertices within the radius; 0 if v is on no face.
     """
     if first[v] == first[v + 1]:
         return 0
     distance[v], disk[0], count = 0.0, v, 1
     front = [(0.0, v)]
-    front.pop()
+    front.pop()  # an empty list whose element type numba knows
     for k in range(first[v], first[v + 1]):
         u = np.int64(neighbours[k])
-        distance[u], angle[u] = _coordinates(vertices, v, u, u)[0], directions[k, 0]
-        disk[count], turns[u] = u, 1
+        distance[u], angle[u] = edge_coordinates(vertices, v, u, u)[0], sectors[k, 0]
+        disk[count], updates[u] = u, 1
         count += 1
         heappush(front, (distance[u], u))
-    limit = radius  # and the longest edge from within: corners out there may decide on one within
+    # the radius plus the longest edge within it: a corner out there may decide on one within
+    limit = radius
     while len(front) > 0:
         now, a = heappop(front)
-        if turns[a] % 2 == 0:
-            continue  # stood here twice
-        turns[a] += 1
+        if updates[a] % 2 == 0:
+            continue  # an outdated entry: a has been processed since
+        updates[a] += 1
         for k in range(first[a], first[a + 1]):
             x, y, z = a, np.int64(neighbours[k]), np.int64(left[k])
             if distance[a] <= radius:
-                limit = max(limit, radius + _coordinates(vertices, x, y, y)[0])
-            for _ in range(2 if z >= 0 else 0):  # the face's two other corners, each from the rest
-                r, angle_z = _third(vertices, x, y, z, distance, angle)
+                limit = max(limit, radius + edge_coordinates(vertices, x, y, y)[0])
+            for _ in range(2 if z >= 0 else 0):  # each other corner of the face, from the other two
+                r, angle_z = _third_corner(vertices, x, y, z, distance, angle)
                 closer = r < CLOSER * distance[z] and (distance[a] <= limit or r <= radius)
-                if closer and turns[z] < 2 * MOST_TURNS:
+                if closer and updates[z] < 2 * MOST_TURNS:
                     if distance[z] == np.inf:
                         disk[count] = z
                         count += 1
                     distance[z], angle[z] = r, angle_z
-                    turns[z] |= 1
-                    heappush(front, (r if turns[z] == 1 else max(r, 1.2 * now), z))
+                    updates[z] |= 1
+                    heappush(front, (r if updates[z] == 1 else max(r, 1.2 * now), z))
                 x, y, z = z, x, y
     within = 0
     for u in disk[:count]:
-        turns[u] = 0
+        updates[u] = 0
         if distance[u] <= radius:
             disk[within] = u
             within += 1
@@ -218,15 +265,16 @@ def _polar(v, vertices, neighbours, first, left, directions, radius, distance, a
 
 
 @njit(cache=True)
-def _third(vertices, a, b, c, distance, angle):
-    """Distance and angle of corner c of a face (a, b, c), as those of a and b give them.
+def _third_corner(vertices, a, b, c, distance, angle):
+    """Distance and angle of corner c of the face (a, b, c), from those of a and b.
 
-    In the plane a is the origin, b lies along x, c above and the source below. Where c does not see
-    it through the edge ab, or there is no such source, the way leads along an edge, by a or by b.
+    In the plane, a is the origin, b lies on the positive x axis, c above it and the source below.
+    Where the segment from c to the source does not cross the edge ab, or no such source exists, the
+    path leads along an edge, through a or b.
     """
     to_a, to_b = distance[a], distance[b]
-    base = _coordinates(vertices, a, b, b)[0]
-    cx, cy = _coordinates(vertices, a, b, c)
+    base = edge_coordinates(vertices, a, b, b)[0]
+    cx, cy = edge_coordinates(vertices, a, b, c)
     if min(to_a, to_b, base) > 0 and max(to_a, to_b) < np.inf:
         x = (to_a**2 - to_b**2 + base**2) / (2 * base)
         y = np.sqrt(max(to_a**2 - x**2, 0.0))
@@ -235,10 +283,11 @@ def _third(vertices, a, b, c, distance, angle):
             r = np.sqrt(cx**2 + cy**2)
             if r >= distance[c]:
                 return r, 0.0  # will not be used
-            wedge = np.arctan2(base * y, y**2 - x * (base - x))  # from b to a, as the source sees
-            part = np.arctan2((base - x) * cy - y * cx, (base - x) * cx + y * cy)  # from b to c
-            # from b to a around v: not `wedge`, but within half a turn of it
-            apart = wedge + _turn(angle[a] - angle[b] - wedge)
+            # angles at the source, in the plane: from b to a, and from b to c
+            wedge = np.arctan2(base * y, y**2 - x * (base - x))
+            part = np.arctan2((base - x) * cy - y * cx, (base - x) * cx + y * cy)
+            # around v, the angle from b to a is not `wedge`, but within half a turn of it
+            apart = wedge + _wrapped(angle[a] - angle[b] - wedge)
             return r, angle[b] + apart * part / wedge
     by_a, by_b = to_a + np.sqrt(cx**2 + cy**2), to_b + np.sqrt((cx - base) ** 2 + cy**2)
     return (by_a, angle[a]) if by_a < by_b else (by_b, angle[b])

@@ -1,4 +1,4 @@
-"""The geodesic convolution of Masci, Boscaini, Bronstein and Vandergheynst (2015)."""
+"""The geodesic convolution of Masci, Boscaini, Bronstein and Vandergheynst 2015."""
 
 from __future__ import annotations
 
@@ -14,15 +14,20 @@ from meshspiral.nn.layers import glorot
 
 
 class Resampling(NamedTuple):
-    """The samples of every vertex's polar grid as weighted sums of vertices: a sparse matrix.
+    """The samples of all polar grids as weighted sums of vertices: a sparse matrix in CSR and CSC.
 
-    Sample s = (v * rays + ray) * rings + ring is the sum over k in first[s]:first[s+1] of
-    weights[k] times the features of vertices[k]. A sample that is not there, since the surface ends
-    before it, has no k, and is 0. The same by columns, for gradients: vertex v is in samples[k],
-    with sample_weights[k], for k in sample_first[v]:sample_first[v+1].
+    With S = V * rays * rings samples, sample s = (v * rays + ray) * rings + ring is the sum of
+    weights[k] * features[vertices[k]] over k in first[s]:first[s + 1]. A sample beyond the boundary
+    of the surface has no k and is 0. The columns serve the gradient: vertex v contributes to
+    samples[k] with sample_weights[k], for k in sample_first[v]:sample_first[v + 1].
 
-    vertices, samples: int32 [E]. weights, sample_weights: float [E].
-    first: int32 [V * rays * rings + 1]. sample_first: int32 [V + 1].
+    Attributes:
+        vertices: int32 [E], by sample.
+        weights: float [E], by sample.
+        first: int32 [S + 1].
+        samples: int32 [E], by vertex.
+        sample_weights: float [E], by vertex.
+        sample_first: int32 [V + 1].
     """
 
     vertices: Tensor
@@ -34,12 +39,20 @@ class Resampling(NamedTuple):
 
 
 def resample(features: Tensor, resampling: Resampling) -> Tensor:
-    """float [V * rays * rings, C], the samples of features [V, C]."""
+    """Sample vertex features on the polar grids.
+
+    Args:
+        features: float [V, C].
+        resampling: The sparse matrix of the mesh.
+
+    Returns:
+        float [V * rays * rings, C].
+    """
     return _Resample.apply(features, *resampling)
 
 
 class _Resample(torch.autograd.Function):
-    """Forwards and backwards a sum over rows: no two threads add to one place."""
+    """A sum over rows in both passes, so that no two threads add to the same entry."""
 
     @staticmethod
     def forward(ctx, features, vertices, weights, first, *columns):
@@ -64,17 +77,24 @@ def _sum_rows(x: Tensor, indices: Tensor, weights: Tensor, first: Tensor) -> Ten
 
 
 class GeodesicConv(nn.Module):
-    """The correlation of every patch with a template on the polar grid, at its best rotation.
+    """Correlation of each patch with a template on the polar grid, maximised over rotations.
 
-    out[v, o] = max over t of the sum over ray, ring and c of
-    weight[o, ray, ring, c] * sample[v, (ray + t) modulo rays, ring, c]: a patch's first ray is
-    arbitrary, and does not matter. rays * rings weights per pair of channels, and no bias.
+    out[v, o] is the maximum over t of the sum over ray, ring and c of
+    weight[o, ray, ring, c] * sample[v, (ray + t) % rays, ring, c]. The first ray of a patch is
+    arbitrary; the maximum makes the layer independent of it. The layer has rays * rings weights per
+    pair of channels and no bias.
 
-    To try all rotations is a circular correlation along the rays. It is formed as a product of
-    Fourier coefficients: at 16 rays 8 products of complex numbers instead of 16 * 16 of real ones.
+    Correlating at all rotations is a circular correlation along the rays. It is computed as a
+    product of Fourier coefficients: with 16 rays, 8 complex products instead of 16 * 16 real ones.
 
-    Takes features float [V, in_features] and their resampling; gives float [V, out_features].
-    Errors: ValueError unless rays is even.
+    Args:
+        in_features: Number of input channels per vertex.
+        out_features: Number of output channels per vertex.
+        rings: Number of rings of the polar grid.
+        rays: Number of rays of the polar grid; even.
+
+    Raises:
+        ValueError: `rays` is odd.
     """
 
     def __init__(self, in_features: int, out_features: int, rings: int = 5, rays: int = 16):
@@ -85,26 +105,37 @@ class GeodesicConv(nn.Module):
         glorot(self.weight, rays * rings * in_features, out_features)
 
     def forward(self, features: Tensor, resampling: Resampling) -> Tensor:
+        """Apply the layer. Under autocast, only products of Fourier coefficients use its dtype.
+
+        Args:
+            features: float [V, in_features].
+            resampling: The samples of the mesh's polar grids, with the layer's rays and rings.
+
+        Returns:
+            float [V, out_features].
+        """
         outs, rays, *_ = self.weight.shape
         half, width = rays // 2, self.weight[0, 0].numel()
         features = features.to(self.weight.dtype)
         basis = _fourier_basis(rays, features.dtype, features.device)
-        exact = torch.autocast(features.device.type, enabled=False)
-        with exact:
+        full_precision = torch.autocast(features.device.type, enabled=False)
+        with full_precision:
             samples = resample(features, resampling).view(-1, rays, width)
             spectrum = (basis @ samples).view(-1, half, 2 * width).transpose(0, 1)
             template = basis @ self.weight.view(outs, rays, width)
             template = template.view(outs, half, 2, width).permute(2, 1, 3, 0) * rays**0.5
             for_real, for_imaginary = _conjugate_products(*template)
         real, imaginary = spectrum.bmm(for_real), spectrum.bmm(for_imaginary)
-        with exact:
+        with full_precision:
             return _LargestRotation.apply(real, imaginary, basis)
 
 
 @cache
 def _fourier_basis(rays: int, dtype: torch.dtype, device: torch.device) -> Tensor:
-    """[rays, rays], orthonormal: in rows 2k and 2k + 1 the real and the imaginary part of frequency
-    k; beside frequency 0, which has no imaginary part, frequency rays / 2, which has none either.
+    """The orthonormal real Fourier basis, float [rays, rays].
+
+    Rows 2k and 2k + 1 hold the real and imaginary part of frequency k. Frequencies 0 and rays / 2
+    have no imaginary part: row 0 holds frequency 0, and row 1 holds frequency rays / 2.
     """
     turn = torch.arange(rays, dtype=torch.float64) * (2 * math.pi / rays)
     k = torch.arange(rays // 2, dtype=torch.float64)[:, None]
@@ -114,11 +145,19 @@ def _fourier_basis(rays: int, dtype: torch.dtype, device: torch.device) -> Tenso
 
 
 def _conjugate_products(real: Tensor, imaginary: Tensor) -> tuple[Tensor, Tensor]:
-    """The matrices by which coefficients (x, y) go to those of a correlation with a template.
+    """The matrices that map Fourier coefficients of samples to those of their correlation.
 
-    (real - i imaginary)(x + i y) = (x real + y imaginary) + i (y real - x imaginary); the first
-    frequency holds two real ones, which go their own ways. All [half, width, outs]; returned are
-    two [half, 2 width, outs], for the real and the imaginary part.
+    For sample coefficients x + i y and template coefficients real + i imaginary:
+    (real - i imaginary)(x + i y) = (x real + y imaginary) + i (y real - x imaginary).
+    The first pair is not a complex number but two real ones, frequencies 0 and rays / 2, which are
+    multiplied separately.
+
+    Args:
+        real: float [rays / 2, width, out_features].
+        imaginary: float [rays / 2, width, out_features].
+
+    Returns:
+        Two float [rays / 2, 2 width, out_features], for the real and the imaginary part.
     """
     paired = real.new_full((len(real), 1, 1), 0.5**0.5)
     paired[0] = 0.0
@@ -130,9 +169,10 @@ def _conjugate_products(real: Tensor, imaginary: Tensor) -> tuple[Tensor, Tensor
 
 
 class _LargestRotation(torch.autograd.Function):
-    """From Fourier coefficients along the rotations, 2 [rays / 2, V, outs], the maximum [V, outs].
+    """The maximum over rotations, float [V, outs], of a correlation given by its coefficients.
 
-    Of all rotations only the best takes part in the gradient: it is never written out for others.
+    The coefficients are two float [rays / 2, V, outs], real and imaginary. Only the best rotation
+    has a gradient, so the gradient of all rotations is never stored.
     """
 
     @staticmethod

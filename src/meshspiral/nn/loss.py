@@ -1,4 +1,4 @@
-"""Softmax cross-entropy over a last linear layer, without ever holding all its scores."""
+"""Softmax cross-entropy over the last linear layer, chunk by chunk to save memory."""
 
 from __future__ import annotations
 
@@ -9,16 +9,24 @@ from torch import Tensor
 
 from meshspiral.nn.precision import add_product, product_dtype
 
-ROWS = 512  # scores of 512 vertices at a time stay in a processor's cache
+ROWS = 512  # vertices per chunk; their scores fit in the processor's cache
 
 
 def linear_cross_entropy(x: Tensor, weight: Tensor, bias: Tensor, labels: Tensor) -> Tensor:
-    """mean over v of -log softmax(x[v] weight^T + bias)[labels[v]], as a scalar.
+    """Mean cross-entropy of a linear layer, without storing all its scores.
 
-    x: float [V, C]. weight: float [K, C]. bias: float [K]. labels: int64 [V].
-    The same as F.cross_entropy(F.linear(x, weight, bias), labels). Gradients are formed chunk by
-    chunk while the scores are there, so memory is that of ROWS rows. Under autocast the products
-    are in its dtype; the sums are in float32 all the same. Can't be differentiated twice.
+    Equals `F.cross_entropy(F.linear(x, weight, bias), labels)`. The gradients are computed in the
+    forward pass, chunk by chunk, so scores take the memory of ROWS rows. Under autocast, products
+    are computed in autocast's dtype and sums in float32. Not twice differentiable.
+
+    Args:
+        x: Inputs of the layer, float [V, C].
+        weight: float [K, C].
+        bias: float [K].
+        labels: Class indices, int64 [V].
+
+    Returns:
+        A scalar: the mean over v of -log softmax(x[v] weight^T + bias)[labels[v]].
     """
     return _LinearCrossEntropy.apply(x, weight, bias, labels)
 
@@ -27,29 +35,29 @@ class _LinearCrossEntropy(torch.autograd.Function):
     @staticmethod
     def forward(ctx, x, weight, bias, labels):
         device = x.device.type
-        product = product_dtype(weight)
-        x_low, weight_low = x.detach().to(product), weight.detach().to(product)
-        total = torch.promote_types(product, torch.float32)  # of sums over rows
+        dtype = product_dtype(weight)
+        x_low, weight_low = x.detach().to(dtype), weight.detach().to(dtype)
+        sum_dtype = torch.promote_types(dtype, torch.float32)  # for sums over rows
         grad_x = torch.empty_like(x_low)
-        grad_weight = torch.zeros(weight.shape, dtype=total, device=weight.device)
-        grad_bias = torch.zeros(bias.shape, dtype=total, device=bias.device)
-        loss = torch.zeros((), dtype=total, device=x.device)
-        wants_gradient = any(ctx.needs_input_grad)
+        grad_weight = torch.zeros(weight.shape, dtype=sum_dtype, device=weight.device)
+        grad_bias = torch.zeros(bias.shape, dtype=sum_dtype, device=bias.device)
+        loss = torch.zeros((), dtype=sum_dtype, device=x.device)
+        needs_gradient = any(ctx.needs_input_grad)
         with torch.autocast(device, enabled=False):
             for start in range(0, len(x), ROWS):
                 rows = slice(start, start + ROWS)
                 label = labels[rows, None]
-                scores = (x_low[rows] @ weight_low.T).to(total).add_(bias.detach())
+                scores = (x_low[rows] @ weight_low.T).to(sum_dtype).add_(bias.detach())
                 scores -= scores.amax(dim=1, keepdim=True)
-                right = scores.gather(1, label)
+                label_score = scores.gather(1, label)
                 sums = scores.exp_().sum(dim=1, keepdim=True)
-                loss += (sums.log() - right).sum()
-                if not wants_gradient:
+                loss += (sums.log() - label_score).sum()
+                if not needs_gradient:
                     continue
-                scores /= sums * len(x)  # now the gradient by the scores, but for the label's
-                scores.scatter_add_(1, label, torch.full_like(right, -1.0 / len(x)))
+                scores /= sums * len(x)  # the gradient of the scores, except at the label
+                scores.scatter_add_(1, label, torch.full_like(label_score, -1.0 / len(x)))
                 grad_bias += scores.sum(dim=0)
-                grad = scores.to(product)
+                grad = scores.to(dtype)
                 torch.mm(grad, weight_low, out=grad_x[rows])
                 add_product(grad_weight, grad.T, x_low[rows])
         ctx.save_for_backward(
@@ -70,9 +78,14 @@ class _LinearCrossEntropy(torch.autograd.Function):
 
 
 class Prediction(NamedTuple):
-    """classes int64 [V], of the largest score; probability float [V], the softmax of that score.
-    With labels: of_label float [V], the softmax of theirs, and loss, as `linear_cross_entropy`
-    gives it; else None."""
+    """The predicted class of each row and its softmax probability.
+
+    Attributes:
+        classes: Class with the largest score, int64 [V].
+        probability: Softmax probability of that class, float [V].
+        of_label: Softmax probability of the label, float [V]; None without labels.
+        loss: Mean cross-entropy, as `linear_cross_entropy` returns it; None without labels.
+    """
 
     classes: Tensor
     probability: Tensor
@@ -82,9 +95,19 @@ class Prediction(NamedTuple):
 
 @torch.no_grad()
 def predict(x: Tensor, weight: Tensor, bias: Tensor, labels: Tensor | None = None) -> Prediction:
-    """The class with the largest score x weight^T + bias. Arguments as above.
+    """Predict the class with the largest score x weight^T + bias, in chunks of ROWS rows.
 
-    Never in bf16: among its 8 bits many scores would tie, and the first class win.
+    Scores are always in the dtype of `weight`, even under autocast: bf16 has 8 significant bits, so
+    many scores would tie, and the tie would go to the lowest class.
+
+    Args:
+        x: Inputs of the layer, float [V, C].
+        weight: float [K, C].
+        bias: float [K].
+        labels: Class indices, int64 [V], or None.
+
+    Returns:
+        The prediction; with labels, also their probabilities and the loss.
     """
     classes = torch.empty(len(x), dtype=torch.int64, device=x.device)
     probability = torch.empty(len(x), dtype=weight.dtype, device=x.device)
@@ -95,10 +118,10 @@ def predict(x: Tensor, weight: Tensor, bias: Tensor, labels: Tensor | None = Non
             scores = torch.addmm(bias, x[rows].to(weight.dtype), weight.T)
             best = torch.argmax(scores, dim=1, keepdim=True)
             scores -= scores.gather(1, best)
-            right = None if labels is None else scores.gather(1, labels[rows, None])
+            label_score = None if labels is None else scores.gather(1, labels[rows, None])
             sums = scores.exp_().sum(1, keepdim=True)
-            if right is not None:
-                losses[rows] = (sums.log() - right)[:, 0]
+            if label_score is not None:
+                losses[rows] = (sums.log() - label_score)[:, 0]
             classes[rows], probability[rows] = best[:, 0], 1 / sums[:, 0]
     if losses is None:
         return Prediction(classes, probability, None, None)

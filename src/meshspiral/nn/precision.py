@@ -1,5 +1,4 @@
-"""Products in the dtype of autocast, sums in a wider one: what layers with a gradient of their own
-must see to themselves."""
+"""Mixed precision for layers with their own gradient: products in autocast's dtype, wider sums."""
 
 from __future__ import annotations
 
@@ -8,13 +7,26 @@ from torch import Tensor
 
 
 def product_dtype(weight: Tensor) -> torch.dtype:
-    """What products with a weight are computed in: autocast's dtype where it is on."""
+    """The dtype for products with a weight.
+
+    Args:
+        weight: The layer's weight, on any device.
+
+    Returns:
+        Autocast's dtype for the weight's device if autocast is enabled, else the weight's dtype.
+    """
     device = weight.device.type
     return torch.get_autocast_dtype(device) if torch.is_autocast_enabled(device) else weight.dtype
 
 
 def add_product(total: Tensor, a: Tensor, b: Tensor) -> None:
-    """total += a b, in one pass where the dtypes allow it."""
+    """Add the matrix product a b to `total` in place, in one pass if the dtypes are equal.
+
+    Args:
+        total: float [M, N].
+        a: float [M, K], in the dtype of `total` or a narrower one.
+        b: float [K, N], in the dtype of `a`.
+    """
     if a.dtype == total.dtype:
         total.addmm_(a, b)
     else:

@@ -1,8 +1,8 @@
-"""The LSTM's recurrence over spirals, with a gradient of its own.
+"""The LSTM recurrence over spirals, as an autograd function with its own backward pass.
 
-Each step writes its gates, cells and hidden states into buffers, where the gradient finds them, and
-the gates' gradient takes the gates' place. All four gates take one sigmoid: the cell gate is
-tanh(x) = 1 - 2 sigmoid(-2 x), with the -2 in its weights.
+Each step writes gates, cells and hidden states into buffers that the backward pass reads; the
+gradient of the gates then overwrites the gates. All four gates use one sigmoid: the cell gate is
+tanh(x) = 1 - 2 sigmoid(-2 x), with the factor -2 inside sigmoid folded into the weights.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from torch import Tensor
 
 from meshspiral.nn.precision import add_product
 
-ROWS = 512  # sequences at a time: their states stay in the processor's cache
+ROWS = 512  # sequences per chunk; their states fit in the processor's cache
 _sigmoid_backward = torch.ops.aten.sigmoid_backward.grad_input
 _tanh_backward = torch.ops.aten.tanh_backward.grad_input
 
@@ -26,136 +26,181 @@ def recurrence(
     metric: Tensor | None = None,
     metric_weight: Tensor | None = None,
 ) -> Tensor:
-    """float [R, H]: the hidden state of each of R sequences at its last real element.
+    """The hidden state of an LSTM at the last element of each sequence before padding.
 
-    projected: float [V, 4 H], the share of the gates (input, forget, cell, output) that each
-    vertex has in them as an element, biases included. weight: float [4 H, H]. spirals: int64
-    [R, N], -1 where one has ended; each has an element. metric: float [R, N, M], with
-    metric_weight: float [4 H, M]. No gradient by `metric`. Products are in the dtype of
-    `projected`, states in that of `weight`. Its gradient can be formed once.
+    Gates are in the order input, forget, cell, output. Products are computed in the dtype of
+    `projected`, states in that of `weight`. `metric` gets no gradient.
+
+    Args:
+        projected: Contribution of each vertex to the gates, biases included, float [V, 4 H].
+        weight: Recurrent weight, float [4 H, H].
+        spirals: Vertex indices of R sequences, int64 [R, N], padded with -1; the first column has
+            no padding.
+        metric: Metric features, float [R, N, M].
+        metric_weight: Weight of the metric features, float [4 H, M]; required with `metric`.
+
+    Returns:
+        float [R, H].
+
+    Raises:
+        RuntimeError: In a second backward pass, since the first one frees the buffers.
     """
     return _Recurrence.apply(projected, weight, metric_weight, spirals, metric)
 
 
 class _Recurrence(torch.autograd.Function):
-    """ROWS sequences after the other."""
+    """The recurrence in chunks of ROWS sequences."""
 
     @staticmethod
     def forward(ctx, projected, weight, metric_weight, spirals, metric):
-        cell_gate = _scales(weight.shape[1], -2.0, weight)
-        entering = projected.to(weight.dtype) * cell_gate
-        recurrent = (weight.T * cell_gate).to(projected.dtype)
-        by_metric = None if metric is None else metric_weight.T * cell_gate
-        out, keep = weight.new_empty(len(spirals), weight.shape[1]), any(ctx.needs_input_grad)
+        scales = _gate_scales(weight.shape[1], -2.0, weight)
+        inputs = projected.to(weight.dtype) * scales
+        recurrent = (weight.T * scales).to(projected.dtype)
+        metric_map = None if metric is None else metric_weight.T * scales
+        out = weight.new_empty(len(spirals), weight.shape[1])
+        save = any(ctx.needs_input_grad)
 
-        ctx.walks = []
+        ctx.chunks = []
         for start in range(0, len(spirals), ROWS):
             rows = slice(start, start + ROWS)
             extra = None if metric is None else metric[rows].to(weight.dtype)
-            walked = _walk(entering, recurrent, by_metric, spirals[rows], extra, out[rows], keep)
-            if keep:
-                ctx.walks.append((rows, walked))
+            buffers = _forward_steps(
+                inputs, recurrent, metric_map, spirals[rows], extra, out[rows], save
+            )
+            if save:
+                ctx.chunks.append((rows, buffers))
         ctx.save_for_backward(weight, metric_weight)
-        ctx.vertices, ctx.product = len(projected), projected.dtype
+        ctx.vertices, ctx.product_dtype = len(projected), projected.dtype
         return out
 
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx, grad):
-        if ctx.walks is None:
-            raise RuntimeError("the gradient of a recurrence can be formed once")
+        if ctx.chunks is None:
+            raise RuntimeError(
+                "backward of an LSTM layer can run only once per forward pass; "
+                "run the forward pass again"
+            )
         weight, metric_weight = ctx.saved_tensors
-        cell_gate = _scales(weight.shape[1], 4.0, weight)  # of d sigmoid(-2 x), for that of tanh(x)
-        recurrent = (weight * cell_gate[:, None]).to(ctx.product)
+        # d tanh(x) / dx = 4 s (1 - s) with s = sigmoid(-2 x); sigmoid_backward gives s (1 - s)
+        scales = _gate_scales(weight.shape[1], 4.0, weight)
+        recurrent = (weight * scales[:, None]).to(ctx.product_dtype)
         grad = grad.to(weight.dtype)
 
         d_projected = weight.new_zeros(ctx.vertices, len(weight))
         d_weight = torch.zeros_like(weight)
         d_metric = None if metric_weight is None else torch.zeros_like(metric_weight)
-        walks, ctx.walks = ctx.walks, None
-        while walks:  # what a block kept is freed when it is done
-            rows, walked = walks.pop()
-            _walk_back(walked, grad[rows], recurrent, d_projected, d_weight, d_metric)
-        d_projected *= cell_gate
-        d_weight *= cell_gate[:, None]
+        chunks, ctx.chunks = ctx.chunks, None
+        while chunks:  # pop, so that the buffers of each chunk are freed after its use
+            rows, buffers = chunks.pop()
+            _backward_steps(buffers, grad[rows], recurrent, d_projected, d_weight, d_metric)
+        d_projected *= scales
+        d_weight *= scales[:, None]
         if d_metric is not None:
-            d_metric *= cell_gate[:, None]
-        return d_projected.to(ctx.product), d_weight, d_metric, None, None
+            d_metric *= scales[:, None]
+        return d_projected.to(ctx.product_dtype), d_weight, d_metric, None, None
 
 
-class _Walk(NamedTuple):
-    """What N steps of R sequences leave for their gradient: elements [N, R]; where they have ended
-    [N, R, 1], and whether any has; metric [R, N, M]; and their states [N, R, ...]."""
+class _Buffers(NamedTuple):
+    """What the N forward steps of R sequences save for the backward pass.
 
-    elements: Tensor
-    ended: Tensor
-    ends: list[bool]
+    Attributes:
+        indices: Vertex indices with 0 at padding, int64 [N, R].
+        padding: Whether an element is padding, bool [N, R, 1].
+        has_padding: For each step, whether any sequence has padding there; N entries.
+        metric: Metric features, float [R, N, M], or None.
+        gates: Activations of the gates, float [N, R, 4 H].
+        cells: Cell states, float [N, R, H].
+        hidden: Hidden states, float [N, R, H].
+    """
+
+    indices: Tensor
+    padding: Tensor
+    has_padding: list[bool]
     metric: Tensor | None
     gates: Tensor
     cells: Tensor
     hidden: Tensor
 
 
-def _walk(
-    entering: Tensor,
+def _forward_steps(
+    inputs: Tensor,
     recurrent: Tensor,
-    by_metric: Tensor | None,
+    metric_map: Tensor | None,
     spirals: Tensor,
     metric: Tensor | None,
     out: Tensor,
-    keep: bool,
-) -> _Walk:
-    """Steps of LSTM; their last hidden states [R, H] go into `out`. If nothing need be kept, two
-    steps' states are."""
+    save: bool,
+) -> _Buffers:
+    """Run the LSTM over R sequences and write their last hidden states into `out`.
+
+    Args:
+        inputs: Scaled contribution of each vertex to the gates, float [V, 4 H].
+        recurrent: Scaled recurrent weight, transposed, float [H, 4 H].
+        metric_map: Scaled weight of the metric features, transposed, float [M, 4 H].
+        spirals: int64 [R, N].
+        metric: float [R, N, M].
+        out: Result, float [R, H].
+        save: Whether to save all steps; if not, two slots are reused in turn.
+    """
     (rows, length), width = spirals.shape, recurrent.shape[0]
-    kept = length if keep else 2
-    gates = entering.new_empty(kept, rows, 4 * width)
-    cells, hidden = entering.new_empty(2, kept, rows, width)
-    elements, ended = spirals.clamp(min=0).T.contiguous(), (spirals < 0).T[..., None]
-    ends = ended.any(dim=1).flatten().tolist()
+    slots = length if save else 2
+    gates = inputs.new_empty(slots, rows, 4 * width)
+    cells, hidden = inputs.new_empty(2, slots, rows, width)
+    indices, padding = spirals.clamp(min=0).T.contiguous(), (spirals < 0).T[..., None]
+    has_padding = padding.any(dim=1).flatten().tolist()
     gate, cell, state = gates.unbind(), cells.unbind(), hidden.unbind()
-    i, f, g, o = _of_steps(gates)
+    i, f, g, o = _split_gates(gates)
     for step in range(length):
-        now, before = step % kept, (step - 1) % kept
-        torch.index_select(entering, 0, elements[step], out=gate[now])
+        now, before = step % slots, (step - 1) % slots
+        torch.index_select(inputs, 0, indices[step], out=gate[now])
         if metric is not None:
-            gate[now].addmm_(metric[:, step], by_metric)
+            gate[now].addmm_(metric[:, step], metric_map)
         if step > 0:
             add_product(gate[now], state[before].to(recurrent.dtype), recurrent)
         gate[now].sigmoid_()
-        torch.addcmul(i[now], i[now], g[now], value=-2, out=cell[now])
+        torch.addcmul(i[now], i[now], g[now], value=-2, out=cell[now])  # i tanh = i (1 - 2 g)
         if step > 0:
             cell[now].addcmul_(f[now], cell[before])
         torch.tanh(cell[now], out=state[now]).mul_(o[now])
-        if ends[step]:
-            for each in (cell, state):
-                torch.where(ended[step], each[before], each[now], out=each[now])
+        if has_padding[step]:
+            for buffer in (cell, state):  # padding leaves cell and hidden state unchanged
+                torch.where(padding[step], buffer[before], buffer[now], out=buffer[now])
     out.copy_(state[now])
-    return _Walk(elements, ended, ends, metric, gates, cells, hidden)
+    return _Buffers(indices, padding, has_padding, metric, gates, cells, hidden)
 
 
-def _walk_back(
-    walked: _Walk,
+def _backward_steps(
+    buffers: _Buffers,
     grad: Tensor,
     recurrent: Tensor,
     d_projected: Tensor,
     d_weight: Tensor,
     d_metric: Tensor | None,
 ) -> None:
-    """Adds to the gradients what one by `out`, [R, H], makes of them, but for the cell gate's
-    scale. The gates are lost."""
-    elements, ended, ends, metric, gates, cells, hidden = walked
-    product, width = recurrent.dtype, recurrent.shape[1]
+    """Add the gradients of R sequences, not yet scaled for the cell gate. Overwrites the gates.
+
+    Args:
+        buffers: Of the forward steps; its gates are overwritten by their gradient.
+        grad: Gradient of the last hidden states, float [R, H].
+        recurrent: Scaled recurrent weight, float [4 H, H].
+        d_projected: Gradient to add to, float [V, 4 H].
+        d_weight: Gradient to add to, float [4 H, H].
+        d_metric: Gradient to add to, float [4 H, M].
+    """
+    indices, padding, has_padding, metric, gates, cells, hidden = buffers
+    dtype, width = recurrent.dtype, recurrent.shape[1]
     d_hidden, d_cell = grad.clone(), torch.zeros_like(grad)
-    one, tanh, d_gate = torch.empty_like(grad), torch.empty_like(grad), torch.empty_like(gates[0])
+    scratch, tanh = torch.empty_like(grad), torch.empty_like(grad)
+    d_gate = torch.empty_like(gates[0])
     d_i, d_f, d_g, d_o = d_gate.split(width, dim=1)
     gate, cell = gates.unbind(), cells.unbind()
-    i, f, g, o = _of_steps(gates)
+    i, f, g, o = _split_gates(gates)
     for step in reversed(range(len(gate))):
-        held = (d_hidden.clone(), d_cell.clone()) if ends[step] else None
+        passed = (d_hidden.clone(), d_cell.clone()) if has_padding[step] else None
         torch.tanh(cell[step], out=tanh)
-        torch.mul(d_hidden, tanh, out=d_o), torch.mul(d_hidden, o[step], out=one)
-        d_cell += _tanh_backward(one, tanh, grad_input=one)
+        torch.mul(d_hidden, tanh, out=d_o), torch.mul(d_hidden, o[step], out=scratch)
+        d_cell += _tanh_backward(scratch, tanh, grad_input=scratch)
         torch.addcmul(d_cell, d_cell, g[step], value=-2, out=d_i)
         torch.mul(d_cell, i[step], out=d_g)
         if step > 0:
@@ -164,28 +209,28 @@ def _walk_back(
         else:
             d_f.zero_()
         _sigmoid_backward(d_gate, gate[step], grad_input=gate[step])
-        if held:
-            gate[step].masked_fill_(ended[step], 0.0)
+        if passed:
+            gate[step].masked_fill_(padding[step], 0.0)
         if step > 0:
-            d_hidden = (gate[step].to(product) @ recurrent).to(grad.dtype)
-        if held:
-            d_hidden += held[0] * ended[step]
-            torch.where(ended[step], held[1], d_cell, out=d_cell)
+            d_hidden = (gate[step].to(dtype) @ recurrent).to(grad.dtype)
+        if passed:  # at padding, the gradient passes through unchanged
+            d_hidden += passed[0] * padding[step]
+            torch.where(padding[step], passed[1], d_cell, out=d_cell)
     flat = gates.flatten(0, 1)
-    d_projected.index_add_(0, elements.view(-1), flat)
+    d_projected.index_add_(0, indices.view(-1), flat)
     later, states = gates[1:].flatten(0, 1), hidden[:-1].flatten(0, 1)
-    add_product(d_weight, later.to(product).T, states.to(product))
+    add_product(d_weight, later.to(dtype).T, states.to(dtype))
     if metric is not None:
         d_metric.addmm_(flat.T, metric.transpose(0, 1).flatten(0, 1))
 
 
-def _of_steps(gates: Tensor) -> list[tuple[Tensor, ...]]:
-    """Of [N, R, 4 H]: for each of the four gates its [R, H] in every step."""
+def _split_gates(gates: Tensor) -> list[tuple[Tensor, ...]]:
+    """For each of the four gates, a tuple with its [R, H] view of every step of `gates`."""
     return [gate.unbind() for gate in gates.chunk(4, dim=2)]
 
 
-def _scales(width: int, scale: float, like: Tensor) -> Tensor:
-    """[4 width]: scale in the place of the cell gate, the third, and 1 elsewhere."""
+def _gate_scales(width: int, scale: float, like: Tensor) -> Tensor:
+    """float [4 width]: `scale` for the cell gate, which is the third, and 1 for the others."""
     scales = like.new_ones(4, width)
     scales[2] = scale
     return scales.view(-1)

@@ -1,113 +1,36 @@
-"""Finished runs side by side: what differs between them, their groups of seeds, tables."""
+"""Groups of runs that differ in the seed alone, and what tells the groups apart."""
 
 from __future__ import annotations
 
-import glob
+import itertools
 import json
 import re
-from collections.abc import Iterator
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from meshspiral.data.cache import digest
-from meshspiral.evaluation.outcome import ERRORS, Outcome
-from meshspiral.experiment.runs import CONFIG, METRICS, RunError, stored_config
-from meshspiral.experiment.schema import flat
+from meshspiral.experiment.schema import TrainConfig
+from meshspiral.geometry.digest import digest
+from meshspiral.neighbourhoods import Neighbourhood
+from meshspiral.nn.networks import Network
+from meshspiral.reporting.runs import Run
 
-# where a run was computed, or what its picture shows: not what was computed
-BESIDE = (
-    "trainer.accelerator",
-    "trainer.threads",
-    "trainer.strategy",
-    "data.cache_dir",
-    "data.workers",
-    "data.root",
-    "data.benchmark_root",
-    "picture",
-    "resume",
-    "metric",
-)
-SHARED = ("shot.", "shuffle_vertices")  # settings of every data set, not what tells them apart
-NETWORKS = {"lstm": "LSTM-NET", "fcs": "FCS-NET", "gcnn3": "GCNN3"}
-FIGURES = {
-    "test/exact_match": "exact match (%)",
-    "test/geodesic_error": "mean error",
-    "test/within_0.05": "within 0.05 (%)",
-    "val/exact_match": "validation: exact match (%)",
-    "parameters": "parameters",
-    "seconds/train": "seconds of training",
-}
-
-
-@dataclass(frozen=True, eq=False)
-class Run:
-    """A finished run: its folder, its whole config, what it measured."""
-
-    folder: Path
-    config: dict[str, Any]
-    metrics: dict[str, float]
-    outcome: Outcome
-    curve: np.ndarray
-
-    @property
-    def settings(self) -> dict[str, Any]:
-        """What was computed, by flat keys, without the seed."""
-        keys = flat(self.config)
-        if keys["model.name"] == "gcnn3":
-            keys.pop("seq_len")  # it knows no sequences
-        return {k: v for k, v in keys.items() if k != "seed" and not k.startswith(BESIDE)}
-
-    def figure(self, key: str) -> float:
-        value = self.metrics.get(key, float("nan"))
-        return 100 * value if "%" in FIGURES[key] else value
-
-
-def collect(where: str) -> tuple[list[Run], list[tuple[Path, str]]]:
-    """The finished runs in a folder, at any depth, or in all folders that a pattern names; and the
-    folders of those that are not whole, with the reason. Errors: RunError if there are none."""
-    places = [Path(where)] if Path(where).is_dir() else map(Path, glob.glob(where, recursive=True))
-    places = sorted(places)
-    if not places:
-        raise RunError(f"runs={where}: there is no such folder")
-    folders = sorted({path.parent for place in places for path in place.rglob(CONFIG)})
-    runs, broken = [], []
-    for folder in folders:
-        try:
-            runs.append(read(folder))
-        except RunError as error:
-            broken.append((folder, str(error)))
-    if not runs:
-        reasons = "".join(f"; {reason}" for _, reason in broken[:3])
-        raise RunError(f"runs={where}: holds no finished run{reasons}")
-    return runs, broken
-
-
-def read(folder: Path) -> Run:
-    """Errors: RunError if the run is not finished, or a file of it is damaged."""
-    config = stored_config(folder)
-    path = folder / METRICS
-    if not path.is_file():
-        raise RunError(f"{folder}: not finished, there is no {METRICS}")
-    try:
-        metrics = json.loads(path.read_text())
-        numbers = all(isinstance(value, int | float) for value in metrics.values())
-    except (ValueError, AttributeError, OSError) as error:
-        raise RunError(f"{path} is damaged ({error})") from error
-    if not numbers or "test/exact_match" not in metrics:
-        raise RunError(f"{path} is damaged (it lacks figures)")
-    outcome = Outcome.load(folder / ERRORS)
-    return Run(folder, config, metrics, outcome, outcome.figures()[1])
+# data settings that do not tell data sets apart: what is computed of a shape
+NOT_OF_DATA = ("shot.", "shuffle_vertices")
 
 
 @dataclass(frozen=True, eq=False)
 class Group:
-    """Runs that differ in nothing but the seed.
+    """Runs that differ in the seed alone.
 
-    network, data: as a reader knows them. length: N, or k rings, or None for a network without
-    spirals. metric: None for such a network. others: the other settings that differ somewhere.
+    Attributes:
+        network: Title of the network.
+        data: Label of the data set, see `data_labels`.
+        length: Label of the sequences' length, e.g. "N = 20"; None for a network without sequences.
+        metric: Whether the network reads metric information; None if it cannot.
+        others: The other settings that differ between groups: flat key and value.
+        runs: At least one run.
     """
 
     network: str
@@ -119,144 +42,150 @@ class Group:
 
     @property
     def seeds(self) -> set[int]:
-        return {run.config["seed"] for run in self.runs}
+        return {run.config.seed for run in self.runs}
 
     @property
     def curves(self) -> np.ndarray:
-        """float [R, T], one for each seed."""
+        """The curves of all runs, float64 [R, T] over THRESHOLDS."""
         return np.stack([run.curve for run in self.runs])
 
-    def label(self, *without: str) -> str:
-        """What tells this group from others that are alike in the fields, or other settings, so
-        named."""
+    def label(self, *omit: str) -> str:
+        """A label that tells this group from others.
+
+        Args:
+            *omit: Attributes of the group and keys of `others` to leave out, because they are equal
+                in the groups shown together.
+        """
         parts = []
-        if "network" not in without:
-            parts.append(self.network + ("++" if self.metric and "metric" not in without else ""))
-        elif "metric" not in without and self.metric is not None:
+        if "network" not in omit:
+            parts.append(self.network + ("++" if self.metric and "metric" not in omit else ""))
+        elif "metric" not in omit and self.metric is not None:
             parts.append("with metric information" if self.metric else "without")
-        if "length" not in without and self.length:
+        if "length" not in omit and self.length:
             parts.append(self.length)
-        if "data" not in without:
+        if "data" not in omit:
             parts.append(self.data)
-        others = [f"{k.split('.', 1)[-1]} {plain(v)}" for k, v in self.others if k not in without]
+        others = [f"{short_key(k)} {format_value(v)}" for k, v in self.others if k not in omit]
         return ", ".join([*parts, *others])
 
 
-def grouped(runs: list[Run]) -> list[Group]:
-    """The groups, by network, length and metric information."""
-    others, groups = varied(runs), {}
-    for run, data in zip(runs, data_names(runs), strict=True):
-        model, settings = run.config["model"], run.settings
-        rings, length = model.get("rings"), None
-        if "seq_len" in settings:
-            length = f"{rings} rings" if rings else f"N = {run.config['seq_len']}"
-        theirs = tuple((key, settings[key]) for key in others if key in settings)
-        group = (NETWORKS[model["name"]], data, length, model.get("metric"), theirs)
-        groups.setdefault(json.dumps(group), (*group, []))[-1].append(run)
+def group_runs(runs: list[Run]) -> list[Group]:
+    """Group runs, and sort the groups by data set, network, length and metric information."""
+    keys, titles, groups = varied_settings(runs), network_titles(runs), {}
+    for run, data in zip(runs, data_labels(runs), strict=True):
+        fields = (
+            titles[run.config.model.name],
+            data,
+            Neighbourhood.of(run.config.neighbourhood).length_label,
+            getattr(run.config.model, "metric", None),
+            tuple((key, run.settings[key]) for key in keys if key in run.settings),
+        )
+        groups.setdefault(json.dumps(fields), (*fields, []))[-1].append(run)
 
-    def place(group: Group):
-        number = int(re.search(r"\d+", group.length or "0")[0])
-        return group.data, group.network, bool(group.length), number, bool(group.metric)
+    def rank(group: Group) -> tuple:
+        number = re.search(r"\d+", group.length or "")
+        length = int(number[0]) if number else 0
+        return group.data, group.network, bool(group.length), length, bool(group.metric)
 
-    return sorted((Group(*group) for group in groups.values()), key=place)
+    return sorted((Group(*fields) for fields in groups.values()), key=rank)
 
 
-def data_names(runs: list[Run]) -> list[str]:
-    """For each run the name of its data set, with the policy it was remeshed by, the settings in
-    which sets of that name differ, and a number where their test shapes differ all the same, as
-    those of two folders do."""
-    ways = [
+def network_titles(runs: list[Run]) -> dict[str, str]:
+    """The title of each network by its name; networks with equal titles also show their name."""
+    titles = {name: Network.registered[name].title for name in (r.config.model.name for r in runs)}
+    counts = list(titles.values())
+    return {n: t if counts.count(t) == 1 else f"{t} ({n})" for n, t in titles.items()}
+
+
+def data_labels(runs: list[Run]) -> list[str]:
+    """A label for the data set of each run.
+
+    It consists of the data set's name, the policy of remeshing, the settings in which data sets of
+    that name and policy differ, and a number if their test shapes still differ, as those of two
+    folders do.
+    """
+    datas = [
         {k.removeprefix("data."): v for k, v in run.settings.items() if k.startswith("data.")}
         for run in runs
     ]
-    names: list[str] = []
-    for way in ways:
-        kind = way["name"], way.get("remesh.policy")
-        alike = [w for w in ways if (w["name"], w.get("remesh.policy")) == kind]
-        differ = [k for k, v in way.items() if any(other.get(k) != v for other in alike)]
-        said = [
-            v if isinstance(v, str | int) else digest(json.dumps(v))[:6]
-            for v in (way[k] for k in differ if not k.startswith(SHARED))
+    labels: list[str] = []
+    for data in datas:
+        kind = data["name"], data.get("remesh.policy")
+        same_kind = [d for d in datas if (d["name"], d.get("remesh.policy")) == kind]
+        differing = [k for k, v in data.items() if any(other.get(k) != v for other in same_kind)]
+        values = [
+            value if isinstance(value, str | int) else digest(json.dumps(value))[:6]
+            for value in (data[key] for key in differing if not key.startswith(NOT_OF_DATA))
         ]
-        names.append(" ".join([*filter(None, kind), *map(str, said)]))
-    kinds: dict[str, list[str]] = {}
+        labels.append(" ".join([*filter(None, kind), *map(str, values)]))
+    hashes: dict[str, list[str]] = {}  # of the test shapes, by label
     for i, run in enumerate(runs):
-        kept = run.outcome
-        shuffled = run.config["data"]["shuffle_vertices"]  # by each seed in another order
-        labels = np.sort(kept.labels) if shuffled else kept.labels
-        truth = digest(np.array(kept.names), labels, kept.diameter)
-        known = kinds.setdefault(names[i], [])
-        if truth not in known:
-            known.append(truth)
-        if number := known.index(truth):
-            names[i] += f" ({number + 1})"
-    return names
+        outcome = run.outcome
+        # each seed shuffles in another order
+        labelled = np.sort(outcome.labels) if run.config.data.shuffle_vertices else outcome.labels
+        shapes = digest(np.array(outcome.names), labelled, outcome.diameter)
+        known = hashes.setdefault(labels[i], [])
+        if shapes not in known:
+            known.append(shapes)
+        if number := known.index(shapes):
+            labels[i] += f" ({number + 1})"
+    return labels
 
 
-def varied(runs: list[Run]) -> list[str]:
-    """The settings that differ: between runs of one network, or, but for the model's, of any two.
-    Those that a group has a field for are left out."""
-    found = set()
-    networks = {run.config["model"]["name"] for run in runs}
-    for network in [None, *networks]:
-        several = [r.settings for r in runs if network in (None, r.config["model"]["name"])]
-        for key in set().union(*several):
-            if network is None and (key.startswith("model.") or not all(key in s for s in several)):
-                continue
-            if len({json.dumps(settings.get(key)) for settings in several}) > 1:
-                found.add(key)
-    fields = {"model.name", "model.metric", "model.rings", "seq_len"}
-    of_data = {k for k in found if k.startswith("data.") and not k[5:].startswith(SHARED)}
-    return sorted(found - fields - of_data)
+def varied_settings(runs: list[Run]) -> list[str]:
+    """Keys of the settings that differ between two runs and that no attribute of a group shows.
+
+    A setting of the network, or the neighbourhood's name, counts only if it differs between two
+    runs of one network.
+    """
+    keys = {k for k in differing_keys(runs) if not k.startswith(("model.", "neighbourhood"))}
+    for name in {run.config.model.name for run in runs}:
+        keys |= differing_keys([run for run in runs if run.config.model.name == name])
+    shown = {"model.name", "model.metric"} | length_keys(runs)
+    shown |= {k for k in keys if k.startswith("data.") and not k[5:].startswith(NOT_OF_DATA)}
+    return sorted(keys - shown)
 
 
-def other_settings(groups: list[Group]) -> list[str]:
-    """The settings without a field of their own in which some group differs from another."""
+def differing_keys(runs: list[Run]) -> set[str]:
+    """Keys of the settings that differ between two of the runs that have them."""
+    values: dict[str, set[str]] = {}
+    for run in runs:
+        for key, value in run.settings.items():
+            values.setdefault(key, set()).add(json.dumps(value))
+    return {key for key, several in values.items() if len(several) > 1}
+
+
+def length_keys(runs: list[Run]) -> set[str]:
+    """Keys of the neighbourhoods' settings that the length's label shows.
+
+    A setting is shown if the label changes when the setting takes the value of another run.
+    """
+    distinct = {n.model_dump_json(): n for n in (run.config.neighbourhood for run in runs)}
+    keys = set()
+    for one, other in itertools.permutations(distinct.values(), 2):
+        if one.name != other.name:
+            continue
+        label = Neighbourhood.of(one).length_label
+        for field in type(one).model_fields:
+            changed = one.model_copy(update={field: getattr(other, field)})
+            if Neighbourhood.of(changed).length_label != label:
+                keys.add(f"{one.name}.{field}")
+    return keys
+
+
+def other_keys(groups: list[Group]) -> list[str]:
+    """Keys of the settings in `others` of any group."""
     return sorted({key for group in groups for key, _ in group.others})
 
 
-def labelled(groups: list[Group], *without: str) -> dict[str, np.ndarray]:
-    """Curves [R, T] by what tells the groups apart."""
-    for key in other_settings(groups):
-        if len({json.dumps(dict(group.others).get(key)) for group in groups}) == 1:
-            without += (key,)
-    for field in ("data", "length"):
-        if len({getattr(group, field) for group in groups}) == 1:
-            without += (field,)
-    return {group.label(*without): group.curves for group in groups}
+def short_key(key: str) -> str:
+    """A flat key without its config group: "optim.lr" is "lr", "patch.radius" stays."""
+    group, _, rest = key.partition(".")
+    return rest if rest and group in TrainConfig.model_fields else key
 
 
-def arrangements(groups: list[Group]) -> Iterator[tuple[str, dict[str, np.ndarray]]]:
-    """All groups; and the figures of the paper that they allow: a title, and curves [R, T] by name.
-
-    Networks at one N; several N of one network; with and without metric information.
-    """
-
-    def alike(what: str) -> list[list[Group]]:
-        """Groups that agree in all other fields, if they are several."""
-        keys = [f for f in ("network", "data", "length", "metric", "others") if f != what]
-        found: dict[str, list[Group]] = {}
-        for group in groups:
-            found.setdefault(json.dumps([getattr(group, k) for k in keys]), []).append(group)
-        return [several for several in found.values() if len(several) > 1]
-
-    yield "All runs", labelled(groups)
-    spirals = [group for group in groups if group.length]
-    for data, length, metric in dict.fromkeys((g.data, g.length, g.metric) for g in spirals):
-        here = [g for g in spirals if (g.data, g.length, g.metric) == (data, length, metric)]
-        here += [g for g in groups if g.data == data and not g.length]
-        if len({g.network for g in here}) > 1:
-            what = f"{length} {'with' if metric else 'without'} metric information"
-            yield f"Networks at {what}, {data}", labelled(here, "length", "data", "metric")
-    for here in alike("length"):
-        yield f"Lengths of {here[0].label('length')}", labelled(here, "network", "metric")
-    for here in alike("metric"):
-        title = f"Metric information: {here[0].label('metric')}"
-        yield title, labelled(here, "network", "length", "data")
-
-
-def plain(value: Any) -> str:
-    """As a reader wants it."""
+def format_value(value: Any) -> str:
+    """A setting as text for plots and tables."""
     if value is None:
         return "\u2013"
     if isinstance(value, bool):

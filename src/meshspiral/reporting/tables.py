@@ -1,68 +1,119 @@
-"""Tables of finished runs: for a page, as CSV, for LaTeX."""
+"""Tables of runs and groups: rows of cells, and their CSV, Markdown and LaTeX."""
 
 from __future__ import annotations
 
 import csv
 import io
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from meshspiral.reporting.groups import FIGURES, Group, other_settings, plain
+from meshspiral.data.files import write_file
+from meshspiral.reporting.groups import Group, format_value, other_keys
+from meshspiral.reporting.runs import Run
+
+# column headings of metrics; "%" marks a share that is shown in per cent
+METRIC_COLUMNS = {
+    "test/exact_match": "exact match (%)",
+    "test/geodesic_error": "mean error",
+    "test/within_0.05": "within 0.05 (%)",
+    "val/exact_match": "validation: exact match (%)",
+    "parameters": "parameters",
+    "seconds/train": "seconds of training",
+}
+
+
+def write_tables(groups: list[Group], folder: Path) -> None:
+    """Write table.csv, one row a run, and table.tex and table.md, one row a group."""
+    write_file(folder / "table.csv", csv_text(*run_table(groups)))
+    write_file(folder / "table.tex", latex_text(*group_table(groups)))
+    write_file(folder / "table.md", markdown_text(*group_table(groups)))
 
 
 def run_table(groups: list[Group]) -> tuple[list[str], list[list[Any]]]:
-    """Names of columns, and a row for each run."""
-    others = other_settings(groups)
-    columns = ["network", "N", "metric", "data", "seed", *others, *FIGURES.values(), "folder"]
+    """Column headings, and one row of values for each run."""
+    others = other_keys(groups)
+    columns = ["network", "N", "metric", "data", "seed", *others]
+    columns += [*METRIC_COLUMNS.values(), "folder"]
     rows = []
     for group in groups:
         for run in group.runs:
             rows.append(
                 [
-                    *described(group),
-                    run.config["seed"],
+                    *attribute_cells(group),
+                    run.config.seed,
                     *(dict(group.others).get(key) for key in others),
-                    *(run.figure(key) for key in FIGURES),
+                    *(metric_value(run, key) for key in METRIC_COLUMNS),
                     str(run.folder),
                 ]
             )
     return columns, rows
 
 
-def described(group: Group) -> list[Any]:
+def group_table(groups: list[Group]) -> tuple[list[str], list[list[str]]]:
+    """Column headings, and one row of texts for each group: metrics as `format_metric` has them."""
+    others = other_keys(groups)
+    columns = ["network", "N", "metric", "data", "seeds", *others, *METRIC_COLUMNS.values()]
+    rows = []
+    for group in groups:
+        cells = [*attribute_cells(group), len(group.seeds)]
+        cells += [dict(group.others).get(key) for key in others]
+        metrics = [
+            format_metric([metric_value(run, key) for run in group.runs], key)
+            for key in METRIC_COLUMNS
+        ]
+        rows.append([*map(format_value, cells), *metrics])
+    return columns, rows
+
+
+def attribute_cells(group: Group) -> list[Any]:
+    """The first four cells of a row: network, length, metric information and data set."""
     length = group.length and group.length.removeprefix("N = ")
     return [group.network, length, group.metric, group.data]
 
 
-def as_csv(columns: list[str], rows: list[list[Any]]) -> str:
+def metric_value(run: Run, key: str) -> float:
+    """A metric in the unit of its column; NaN if the run lacks it."""
+    value = run.metrics.get(key, float("nan"))
+    return 100 * value if "%" in METRIC_COLUMNS[key] else value
+
+
+def format_metric(values: list[float], key: str) -> str:
+    """A metric as text.
+
+    Args:
+        values: One value for each run, in the unit of the column.
+        key: Key of `METRIC_COLUMNS`.
+
+    Returns:
+        The mean, with the population standard deviation if there are several runs; a dash if a run
+        lacks the metric.
+    """
+    if key == "parameters":
+        return f"{values[0]:,.0f}"
+    digits = 1 if "%" in METRIC_COLUMNS[key] else 0 if key.startswith("seconds") else 4
+    deviation = f" ± {np.std(values):.{digits}f}" if len(values) > 1 else ""
+    if np.isnan(values).any():
+        return "\u2013"
+    return f"{np.mean(values):.{digits}f}{deviation}"
+
+
+def csv_text(columns: list[str], rows: list[list[Any]]) -> str:
     text = io.StringIO()
     csv.writer(text, lineterminator="\n").writerows([columns, *rows])
     return text.getvalue()
 
 
-def group_table(groups: list[Group]) -> tuple[list[str], list[list[str]]]:
-    """Names of columns, and a row of texts for each group: mean and spread where it has several
-    seeds."""
-    others = other_settings(groups)
-    columns = ["network", "N", "metric", "data", "seeds", *others, *FIGURES.values()]
-    rows = []
-    for group in groups:
-        cells = [*described(group), len(group.seeds), *(dict(group.others).get(k) for k in others)]
-        figures = [spread([run.figure(key) for run in group.runs], key) for key in FIGURES]
-        rows.append([*map(plain, cells), *figures])
-    return columns, rows
-
-
-def as_markdown(columns: list[str], rows: list[list[str]]) -> str:
+def markdown_text(columns: list[str], rows: list[list[str]]) -> str:
     lines = columns, ["---"] * len(columns), *rows
     return "".join(f"| {' | '.join(cell.replace('|', '/') for cell in line)} |\n" for line in lines)
 
 
-def as_tex(columns: list[str], rows: list[list[str]]) -> str:
-    """A table for booktabs."""
-    sides = "".join("r" if column in FIGURES.values() else "l" for column in columns)
-    first, *others = (" & ".join(map(escaped, row)) + r" \\" for row in (columns, *rows))
+def latex_text(columns: list[str], rows: list[list[str]]) -> str:
+    """A LaTeX table; needs the package booktabs."""
+    sides = "".join("r" if column in METRIC_COLUMNS.values() else "l" for column in columns)
+    first, *others = (" & ".join(map(escape_latex, row)) + r" \\" for row in (columns, *rows))
     return "\n".join(
         [
             rf"\begin{{tabular}}{{{sides}}}",
@@ -77,19 +128,8 @@ def as_tex(columns: list[str], rows: list[list[str]]) -> str:
     )
 
 
-def spread(values: list[float], key: str) -> str:
-    """The mean, and the standard deviation of several seeds (over their number), as a reader wants
-    them; a dash where one has no such figure."""
-    if key == "parameters":
-        return f"{values[0]:,.0f}"
-    digits = 1 if "%" in FIGURES[key] else 0 if key.startswith("seconds") else 4
-    several = f" ± {np.std(values):.{digits}f}" if len(values) > 1 else ""
-    if np.isnan(values).any():
-        return "\u2013"
-    return f"{np.mean(values):.{digits}f}{several}"
-
-
-def escaped(text: str) -> str:
+def escape_latex(text: str) -> str:
+    """Text in which LaTeX gives no character a meaning."""
     named = {
         "\\": r"\textbackslash ",
         "^": r"\textasciicircum ",

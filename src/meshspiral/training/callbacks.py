@@ -1,10 +1,7 @@
-"""What happens beside training: a bar, checkpoints, an orderly stop."""
+"""Callbacks of training: progress bar, speed, pictures for TensorBoard, an orderly stop."""
 
 from __future__ import annotations
 
-import contextlib
-import io
-import os
 import signal
 import sys
 import time
@@ -12,63 +9,21 @@ from pathlib import Path
 from typing import Any
 
 import lightning as L
-import torch
-from lightning.pytorch.callbacks import Callback, ModelCheckpoint, ProgressBar
-from lightning.pytorch.plugins.io import TorchCheckpointIO
+from lightning.pytorch.callbacks import Callback, ProgressBar
 from tqdm import tqdm
 
 from meshspiral.evaluation.metrics import THRESHOLDS
-from meshspiral.experiment.runs import LAST, Stopped
-from meshspiral.viz.plots import curve_figure, sketch_figure, template_colors
+from meshspiral.evaluation.run_folder import LAST
+from meshspiral.training.stopping import Stopped
+from meshspiral.viz.colors import template_colors
+from meshspiral.viz.plots import curve_figure, sketch_figure
 from meshspiral.viz.render import upright
 
 
-class WholeFiles(TorchCheckpointIO):
-    """Checkpoints that appear whole or not at all, also when the machine stops or the disk fills.
-
-    The previous checkpoint stays until the next one is complete.
-    """
-
-    def save_checkpoint(self, checkpoint: dict[str, Any], path: Any, storage_options=None) -> None:
-        path = Path(path)
-        path.parent.mkdir(parents=True, exist_ok=True)
-        temporary = path.with_name(f"{path.name}.tmp")
-        try:
-            whole = io.BytesIO()  # torch.save to a full disk would not say that it is full
-            torch.save(checkpoint, whole)
-            with open(temporary, "wb") as file:
-                file.write(whole.getbuffer())
-                file.flush()
-                os.fsync(file.fileno())
-            os.replace(temporary, path)
-        except OSError as error:
-            with contextlib.suppress(OSError):
-                temporary.unlink()
-            reason = error.strerror or error
-            raise OSError(f"cannot write the checkpoint {path} ({reason})") from error
-
-
-class Checkpoint(ModelCheckpoint):
-    """Lightning's, but a run folder that was moved keeps its best checkpoint when it goes on."""
-
-    def load_state_dict(self, state: dict[str, Any]) -> None:
-        here = str(self.dirpath)
-        moved = {
-            name: str(Path(here, Path(state[name]).name))
-            for name in ("best_model_path", "kth_best_model_path", "last_model_path")
-            if state.get(name)
-        }
-        best = {
-            str(Path(here, Path(path).name)): score
-            for path, score in state.get("best_k_models", {}).items()
-        }
-        super().load_state_dict({**state, **moved, "dirpath": here, "best_k_models": best})
-
-
 class Bar(ProgressBar):
-    """One bar for the whole training, with the time left and the latest figures.
+    """One progress bar for the whole training, with the time left and the latest validation.
 
-    Validation and test show one of their own where they take longer than a second.
+    Validation and test show a bar of their own if they take longer than a second.
     """
 
     def __init__(self) -> None:
@@ -83,7 +38,7 @@ class Bar(ProgressBar):
 
     def on_train_start(self, trainer: L.Trainer, module: L.LightningModule) -> None:
         total = trainer.max_epochs * trainer.num_training_batches
-        # in a log file every update is a line
+        # in a log file every update is a line of its own
         every = 0.1 if sys.stderr.isatty() else 10.0
         self._bar = tqdm(
             total=total,
@@ -147,9 +102,10 @@ class Bar(ProgressBar):
 
 
 class Speed(Callback):
-    """Logs training steps per second, validation left out, and keeps the time of training.
+    """Logs training steps per second, without validation, and measures the training time.
 
-    seconds: from the first step to now, validation included, in all parts of a run together.
+    Attributes:
+        seconds: Training time so far with validation, summed over all parts of a resumed run.
     """
 
     def __init__(self) -> None:
@@ -188,9 +144,12 @@ class Speed(Callback):
 
 
 class Looks(Callback):
-    """Into TensorBoard: the curve of validation, and a validation shape, each vertex in the colour
-    of its counterpart; after the first validation, and then as often as 1 % of the time allows.
-    At the end the curve of the test."""
+    """Draws for TensorBoard: the validation curve, and a validation shape coloured by its
+    correspondence.
+
+    It draws after the first validation, and then as often as 1 % of the training time allows; the
+    test curve at the end.
+    """
 
     SHARE = 0.01
 
@@ -223,9 +182,9 @@ class Looks(Callback):
 
 
 class OrderlyStop(Callback):
-    """On Ctrl-C or SIGTERM: finish the step, save last.ckpt, and stop.
+    """Finishes the step on Ctrl-C or SIGTERM, saves last.ckpt, and raises `Stopped`.
 
-    The same signal a second time stops at once; last.ckpt is then that of the last whole epoch.
+    A second signal stops at once; last.ckpt is then that of the last complete epoch.
     """
 
     def __init__(self, folder: Path):
@@ -244,8 +203,8 @@ class OrderlyStop(Callback):
         print("\nstopping after this step ...", file=sys.stderr)
 
     def on_train_batch_start(self, trainer, module, batch, batch_idx) -> None:
-        # Between two steps, and not before the last of an epoch: there Lightning can't tell a
-        # finished epoch from an unfinished one. The start of an epoch is in last.ckpt already.
+        # Never before the last step of an epoch: a checkpoint from there looks to Lightning like
+        # one of a finished epoch. The start of an epoch is in last.ckpt already.
         signum = self._heard(trainer)
         if signum is None or 0 < batch_idx == trainer.num_training_batches - 1:
             return
@@ -254,11 +213,11 @@ class OrderlyStop(Callback):
         raise Stopped(signum)
 
     def _heard(self, trainer: L.Trainer) -> int | None:
-        """The signal that has come to this process, or to one of several: all stop at one step."""
+        """The signal that reached any of the run's processes; all of them stop at the same step."""
         if trainer.world_size == 1:
             return self.signum
         anywhere = trainer.strategy.reduce_boolean_decision(self.signum is not None, all=False)
-        if not anywhere:  # one that came since is for the next step: the others don't know of it
+        if not anywhere:  # the others do not know of a signal that came since: next step
             return None
         return self.signum or signal.SIGTERM
 

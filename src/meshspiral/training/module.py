@@ -1,4 +1,4 @@
-"""Training and testing a network that gives every vertex its counterpart on the template."""
+"""The LightningModule: training and testing a network on correspondences to the template."""
 
 from __future__ import annotations
 
@@ -10,69 +10,69 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from meshspiral.data.datamodule import Batch, derived_seed
 from meshspiral.evaluation.metrics import CorrespondenceError
 from meshspiral.evaluation.outcome import Result, result_of
-from meshspiral.nn.geodesic import Resampling
-from meshspiral.nn.layers import metric_features
+from meshspiral.experiment.schema import TrainConfig, read_stored_config
+from meshspiral.geometry.digest import derived_seed
+from meshspiral.neighbourhoods import Neighbourhood
+from meshspiral.neighbourhoods.base import Batch
 from meshspiral.nn.loss import Prediction, linear_cross_entropy, predict
-from meshspiral.nn.networks import GCNN3, FCSNet, LSTMNet
+from meshspiral.nn.networks import Network
 
 
-def build_network(model: dict[str, Any], seq_len: int, in_features: int, num_classes: int):
-    """The network that a model config describes. Its names are a closed list: a checkpoint's
-    config can't name code to run."""
-    options = {k: v for k, v in model.items() if k not in ("name", "rings", "patch")}
-    if model["name"] == "fcs":
-        return FCSNet(in_features, num_classes, seq_len, **options)
-    if model["name"] == "lstm":
-        return LSTMNet(in_features, num_classes, **options)
-    if model["name"] == "gcnn3":
-        patch = model["patch"]
-        return GCNN3(in_features, num_classes, rings=patch["rings"], rays=patch["rays"], **options)
-    raise ValueError(f"model.name must be fcs, lstm or gcnn3, got {model['name']!r}")
+def build_network(config: TrainConfig, in_features: int, num_classes: int) -> Network:
+    """The network of a config.
+
+    Args:
+        config: Names a registered network; a config cannot name code to run.
+        in_features: Number of channels of the descriptor.
+        num_classes: Number of vertices of the template.
+    """
+    network = Network.registered[config.model.name]
+    neighbourhood = Neighbourhood.of(config.neighbourhood)
+    return network.build(config.model, neighbourhood, in_features, num_classes)
 
 
 class Correspondence(L.LightningModule):
-    """Cross-entropy over the template's vertices; Adam.
+    """Trains with cross-entropy over the template's vertices and Adam; measures geodesic errors.
 
-    config: the whole composed config in plain containers, so that a checkpoint brings it along.
-    in_features: channels of the descriptor. num_classes: vertices of the template.
+    Args:
+        config: A whole `TrainConfig` as a dictionary; checkpoints contain it.
+        in_features: Number of channels of the descriptor.
+        num_classes: Number of vertices of the template.
+
+    Attributes:
+        metrics: For "val" and "test" the metrics of the latest evaluation, by their names in
+            metrics.json. Checkpoints contain those of validation.
+        curves: Likewise the share of correct matches over `THRESHOLDS`.
+        results: Likewise the prediction and the errors of each mesh, by its index.
     """
 
     def __init__(self, config: dict[str, Any], in_features: int, num_classes: int):
         super().__init__()
         self.save_hyperparameters()
-        self.net: nn.Module = build_network(
-            config["model"], config["seq_len"], in_features, num_classes
-        )
-        self.optim = config["optim"]
-        self.seed = config["seed"]
+        settings = read_stored_config(config, "the checkpoint")
+        self.net: Network = build_network(settings, in_features, num_classes)
+        self.optim = settings.optim
+        self.seed = settings.seed
         self.errors = nn.ModuleDict({split: CorrespondenceError() for split in ("val", "test")})
-        # of the latest evaluation of each split; a checkpoint brings those of validation along
-        self.figures: dict[str, dict[str, float]] = {}
+        self.metrics: dict[str, dict[str, float]] = {}
         self.curves: dict[str, np.ndarray] = {}
-        self.results: dict[str, dict[int, Result]] = {}  # likewise, by mesh
+        self.results: dict[str, dict[int, Result]] = {}
 
     def setup(self, stage: str) -> None:
         self.distances = self.trainer.datamodule.reference
 
-    def embed(self, batch: Batch) -> Tensor:
-        if "patches" in batch:
-            return self.net.embed(batch["features"], Resampling(**batch["patches"]))
-        metric = None
-        if self.net.metric:
-            metric = metric_features(batch["vertices"], batch["spirals"], batch["unit"])
-        return self.net.embed(batch["features"], batch["spirals"], metric)
-
     def on_train_batch_start(self, batch: Batch, batch_idx: int) -> None:
-        # Dropout depends on seed, epoch and mesh alone, as all other chance does: a run that was
-        # stopped anywhere goes on as if it had not been.
+        # Dropout depends on seed, epoch and mesh alone, as all other random choices do, so that a
+        # resumed run equals an uninterrupted one.
         torch.manual_seed(derived_seed(self.seed, "dropout", self.current_epoch, batch["index"]))
 
     def training_step(self, batch: Batch, batch_idx: int) -> Tensor:
         head = self.net.head
-        loss = linear_cross_entropy(self.embed(batch), head.weight, head.bias, batch["labels"])
+        loss = linear_cross_entropy(
+            self.net.embed_batch(batch), head.weight, head.bias, batch["labels"]
+        )
         self.log("train/loss", loss, on_step=True, on_epoch=True, batch_size=1, sync_dist=True)
         return loss
 
@@ -83,9 +83,9 @@ class Correspondence(L.LightningModule):
         self._evaluate("test", batch)
 
     def predict(self, batch: Batch) -> Prediction:
-        """The vertex of the template that each vertex gets. Without labels there is no loss."""
+        """Predict a vertex of the template for each vertex; the loss too if there are labels."""
         head = self.net.head
-        return predict(self.embed(batch), head.weight, head.bias, batch.get("labels"))
+        return predict(self.net.embed_batch(batch), head.weight, head.bias, batch.get("labels"))
 
     def _evaluate(self, split: str, batch: Batch) -> None:
         found = self.predict(batch)
@@ -112,9 +112,9 @@ class Correspondence(L.LightningModule):
         self.errors[split].reset()
         self.curves[split] = values.pop("curve").cpu().numpy()
         values["geodesic_error_diameter"] = values["geodesic_error"] / self.distances.diameter
-        self.figures[split] = {f"{split}/{name}": float(value) for name, value in values.items()}
-        # already over all meshes of all ranks, so nothing is left to average
-        self.log_dict(self.figures[split], batch_size=1, sync_dist=True)
+        self.metrics[split] = {f"{split}/{name}": float(value) for name, value in values.items()}
+        # the metrics cover the meshes of all ranks already
+        self.log_dict(self.metrics[split], batch_size=1, sync_dist=True)
         if self.trainer.world_size > 1:
             shares: list[Any] = [None] * self.trainer.world_size
             torch.distributed.all_gather_object(shares, self.results[split])
@@ -131,20 +131,20 @@ class Correspondence(L.LightningModule):
         checkpoint["resolution"] = data.resolution
         checkpoint["processes"] = self.trainer.world_size
         if "val" in self.curves:
-            checkpoint["validation"] = (self.figures["val"], torch.from_numpy(self.curves["val"]))
+            checkpoint["validation"] = (self.metrics["val"], torch.from_numpy(self.curves["val"]))
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         if "validation" in checkpoint:
-            self.figures["val"], curve = checkpoint["validation"]
+            self.metrics["val"], curve = checkpoint["validation"]
             self.curves["val"] = curve.numpy()
 
     def configure_optimizers(self) -> dict[str, Any]:
         optim = self.optim
-        adam = torch.optim.Adam(self.parameters(), lr=optim["lr"], betas=tuple(optim["betas"]))
-        if optim["schedule"] == "constant":
+        adam = torch.optim.Adam(self.parameters(), lr=optim.lr, betas=tuple(optim.betas))
+        if optim.schedule == "constant":
             return {"optimizer": adam}
         steps = max(1, int(self.trainer.estimated_stepping_batches))
-        warmup = max(1, round(optim["warmup"] * steps))
+        warmup = max(1, round(optim.warmup * steps))
 
         def factor(step: int) -> float:
             """Linear from near 0 to 1, then half a cosine down to near 0."""

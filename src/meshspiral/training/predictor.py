@@ -6,39 +6,52 @@ from typing import Any
 
 import torch
 
-from meshspiral.data.datamodule import Batch, rotate
-from meshspiral.experiment.runs import RunError
-from meshspiral.geometry.mesh import Mesh
+from meshspiral.data.datamodule import draw
+from meshspiral.evaluation.run_folder import RunError
+from meshspiral.experiment.schema import TrainConfig
+from meshspiral.neighbourhoods import Neighbourhood
+from meshspiral.neighbourhoods.base import Batch
 from meshspiral.nn.loss import Prediction
+from meshspiral.training.device import choose_precision, device_of
 from meshspiral.training.module import Correspondence
-from meshspiral.training.trainer import choose_precision, device_of
 
 
 class Predictor:
-    """predictor(batch, purpose) is the network's prediction for an item of `MeshDataset`, with or
-    without labels, and with spirals drawn for that purpose.
+    """Predicts with the network of a checkpoint.
 
-    saved: of `read_checkpoint`. settings: its whole config, in plain containers. accelerator: "cpu"
-    or "gpu". Errors: RunError if the weights are not those of the config, ConfigError without a
-    GPU.
+    Args:
+        saved: From `read_checkpoint`.
+        config: Its config, from `config_of`; settings of the data set may differ.
+        accelerator: "cpu" or "gpu".
+
+    Raises:
+        RunError: The weights do not fit the config.
+        ConfigError: There is no GPU.
     """
 
-    def __init__(self, saved: dict[str, Any], settings: dict[str, Any], accelerator: str = "cpu"):
+    def __init__(self, saved: dict[str, Any], config: TrainConfig, accelerator: str = "cpu"):
         self.device = device_of(accelerator)
-        self.precision = choose_precision(settings["trainer"]["precision"], accelerator)
-        self.seed = settings["seed"]
+        self.precision = choose_precision(config.trainer.precision, accelerator)
+        self.seed = config.seed
+        self.neighbourhood = Neighbourhood.of(config.neighbourhood)
         sizes = (saved["hyper_parameters"][key] for key in ("in_features", "num_classes"))
-        self.module = Correspondence(settings, *sizes)
+        self.module = Correspondence(config.model_dump(), *sizes)
         try:
             self.module.load_state_dict(saved["state_dict"])
         except RuntimeError as error:
-            raise RunError("the checkpoint's weights are not those of its config") from error
+            raise RunError("the checkpoint's weights do not fit its config") from error
         dtype = torch.float64 if self.precision == "64-true" else torch.float32
         self.module.to(self.device, dtype).eval()
 
     def __call__(self, batch: Batch, purpose: str) -> Prediction:
+        """Predict a vertex of the template for each vertex of a mesh.
+
+        Args:
+            batch: An item of `MeshDataset`, with or without labels.
+            purpose: Random choices of the neighbourhoods depend on it and on the run's seed.
+        """
         batch = self.module.transfer_batch_to_device(batch, torch.device(self.device), 0)
-        batch = rotate(batch, self.seed, "spirals", purpose)
+        batch = draw(self.neighbourhood, batch, self.seed, "spirals", purpose)
         if self.precision == "64-true":
             batch = {
                 key: value.double() if key in ("features", "vertices", "unit") else value
@@ -47,14 +60,3 @@ class Predictor:
         low = torch.autocast(self.device, torch.bfloat16, enabled=self.precision == "bf16-mixed")
         with torch.inference_mode(), low:
             return self.module.predict(batch)
-
-
-def template_of(saved: dict[str, Any]) -> Mesh:
-    """The template whose vertices a checkpoint's network predicts. Errors: RunError without one."""
-    try:
-        arrays = {name: saved["template"][name].numpy() for name in ("vertices", "faces")}
-    except (KeyError, TypeError, IndexError, AttributeError) as error:
-        raise RunError(
-            "the checkpoint holds no template; it was trained by an older version"
-        ) from error
-    return Mesh(**arrays, name="template")

@@ -1,4 +1,7 @@
-"""Curves and pictures, by matplotlib. None belongs to a window system: `figure.savefig(path)`."""
+"""Figures by matplotlib: error curves, costs, renders with captions, and sketches of meshes.
+
+All functions return a `Figure` that belongs to no window system; save it with `savefig`.
+"""
 
 from __future__ import annotations
 
@@ -6,28 +9,27 @@ import io
 from collections.abc import Mapping
 
 import numpy as np
-from matplotlib import colormaps, cycler, rc_context, rcParams
+from matplotlib import cycler, rc_context, rcParams
 from matplotlib.cm import ScalarMappable
 from matplotlib.collections import PolyCollection
 from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 
-from meshspiral.geometry.mesh import Mesh
+from meshspiral.viz.colors import ERROR_COLORS, MOST_ERROR
 
 ERROR_LABEL = r"geodesic error / $\sqrt{\mathrm{area}}$"
-MOST_ERROR = 0.2  # where colours end, as in the paper
-ERROR_COLORS = colormaps["magma_r"]  # darker with every step, also in greyscale
 DPI = 160
-IN_A_CORNER = 8  # curves whose names leave room for the curves
+MOST_INSIDE = 8  # curves whose legend fits inside the axes
 
 
 def curve_figure(curves: Mapping[str, tuple[np.ndarray, np.ndarray]]) -> Figure:
-    """The share of correct matches over the geodesic error (Kim et al. 2011).
+    """Share of correct matches over the geodesic error threshold (Kim et al. 2011).
 
-    curves: by name, thresholds [T] over sqrt(area), and shares in 0..1: [T], or [R, T] of several
-    runs: their mean, and a band from the least to the most.
+    Args:
+        curves: By name, the thresholds over sqrt(area), float [T], and the shares in 0..1: float
+            [T] of one run, or [R, T] of several, shown as mean and a band from minimum to maximum.
     """
-    many = len(curves) > IN_A_CORNER
+    many = len(curves) > MOST_INSIDE
     size = (7.4, max(3.6, 0.19 * len(curves) + 0.2)) if many else (4.8, 3.6)
     figure = Figure(figsize=size, layout="constrained")
     axes = figure.add_subplot()
@@ -56,8 +58,12 @@ def curve_figure(curves: Mapping[str, tuple[np.ndarray, np.ndarray]]) -> Figure:
 
 
 def all_curves_figure(thresholds: np.ndarray, shares: np.ndarray) -> Figure:
-    """Every curve of [R, T] in one figure, and within it the same in an enlargement of their
-    spread about the mean, in points."""
+    """Curves of several runs, with an inset of their deviations from the mean curve.
+
+    Args:
+        thresholds: float [T], over sqrt(area).
+        shares: float [R, T] in 0..1, a curve for each run.
+    """
     figure = Figure(figsize=(4.8, 3.6), layout="constrained")
     axes = figure.add_subplot()
     axes.plot(thresholds, 100 * shares.T, color="C0", alpha=0.15, linewidth=0.8)
@@ -71,7 +77,7 @@ def all_curves_figure(thresholds: np.ndarray, shares: np.ndarray) -> Figure:
     axes.grid(alpha=0.3)
     inset = axes.inset_axes((0.45, 0.15, 0.5, 0.4))
     inset.plot(thresholds, 100 * (shares - shares.mean(axis=0)).T, color="C0", alpha=0.15, lw=0.8)
-    inset.set_title("from their mean, in points", fontsize="small")
+    inset.set_title("deviation from the mean (points)", fontsize="small")
     inset.set_xlim(0, thresholds[-1])
     inset.tick_params(labelsize="small")
     inset.grid(alpha=0.3)
@@ -79,18 +85,24 @@ def all_curves_figure(thresholds: np.ndarray, shares: np.ndarray) -> Figure:
 
 
 def encoded(figure: Figure, kind: str) -> bytes:
-    """The figure as a "png", "pdf" or "svg" file: the same bytes for the same figure."""
-    when = {"pdf": "CreationDate", "svg": "Date"}.get(kind)
+    """The content of a figure's file; equal figures give equal bytes.
+
+    Args:
+        figure: The figure.
+        kind: "png", "pdf" or "svg".
+    """
+    date = {"pdf": "CreationDate", "svg": "Date"}.get(kind)  # would differ each time
     buffer = io.BytesIO()
     with rc_context({"svg.hashsalt": "figure"}):
-        figure.savefig(buffer, format=kind, dpi=DPI, metadata={when: None} if when else None)
+        figure.savefig(buffer, format=kind, dpi=DPI, metadata={date: None} if date else None)
     return buffer.getvalue()
 
 
 def growth_figure(series: list[dict]) -> Figure:
-    """Seconds and megabytes of a pass over its sizes, both axes logarithmic.
+    """Log-log plots of seconds and megabytes over size; dashed lines show proportionality.
 
-    series: as `meshspiral.benchmarking.scaling.growth` gives them. Dashed: what is proportional to the size.
+    Args:
+        series: As `meshspiral.benchmarking.scaling.growth` returns them.
     """
     overs, units = list(dict.fromkeys(row["over"] for row in series)), ("seconds", "MB")
     figure = Figure(figsize=(3.4 * len(overs), 6.2), layout="constrained")
@@ -126,37 +138,16 @@ def growth_figure(series: list[dict]) -> Figure:
     return figure
 
 
-def template_colors(template: Mesh) -> np.ndarray:
-    """float [K, 3] in 0..1: a colour for each template vertex, from its place in the bounding box.
-
-    Equal colours on two shapes mean: the same place of the template.
-    """
-    return place_colors(template, template.vertices)
-
-
-def place_colors(template: Mesh, points: np.ndarray) -> np.ndarray:
-    """The same for points [V, 3] on the template; grey where they are NaN."""
-    low, high = template.vertices.min(axis=0), template.vertices.max(axis=0)
-    colors = 0.1 + 0.9 * (points - low) / np.maximum(high - low, 1e-12)
-    return np.where(np.isnan(colors), 0.6, colors.clip(0, 1))
-
-
-def error_colors(errors: np.ndarray) -> np.ndarray:
-    """float [V, 3] in 0..1: from pale, right, to dark, an error of 0.2 sqrt(area) and more."""
-    return ERROR_COLORS(np.asarray(errors) / MOST_ERROR)[:, :3]
-
-
-def confidence_colors(confidence: np.ndarray) -> np.ndarray:
-    """float [V, 3] in 0..1: from dark, a confidence of 0, to pale, 1."""
-    return ERROR_COLORS(1 - np.asarray(confidence))[:, :3]
-
-
 def picture_figure(
     images: list[np.ndarray], middles: np.ndarray, captions: list[str], bar: str | None = None
 ) -> Figure:
-    """Views of a row of meshes, one below the other, with captions, and the colours' meaning.
+    """Renders of a row of meshes, one view below the other, with captions.
 
-    images, middles: a `meshspiral.viz.render.Picture`. bar: what the colours show, "error" or "confidence".
+    Args:
+        images: Of a `meshspiral.viz.render.Picture`.
+        middles: Of the same.
+        captions: A name for each mesh.
+        bar: "error" or "confidence" adds the scale of these colours.
     """
     height, width = images[0].shape[:2]
     inches = width / DPI
@@ -185,9 +176,14 @@ def picture_figure(
 
 
 def sketch_figure(points: np.ndarray, faces: np.ndarray, colors: np.ndarray) -> Figure:
-    """A mesh as seen from +z, y up, drawn face by face: rough, in a tenth of a second.
+    """A rough render of a mesh seen from +z with y up, in a tenth of a second.
 
-    points: float [V, 3]. colors: float [V, 3] in 0..1.
+    Visible faces are drawn from back to front.
+
+    Args:
+        points: float [V, 3].
+        faces: int [F, 3].
+        colors: float [V, 3] in 0..1.
     """
     corners = points[faces]
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])

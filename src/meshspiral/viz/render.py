@@ -1,4 +1,4 @@
-"""Pictures of coloured meshes, drawn off-screen by VTK."""
+"""Renders of coloured meshes, off-screen, by VTK."""
 
 from __future__ import annotations
 
@@ -18,42 +18,69 @@ VIEWS = ("front", "back")
 
 
 class RenderError(RuntimeError):
-    """There is no picture; the message says what is missing."""
+    """Nothing could be rendered; the message says what is missing."""
 
 
 class Row(NamedTuple):
-    """Meshes side by side, each with its colours, float [V, 3] in 0..1."""
+    """Meshes to show side by side.
+
+    Attributes:
+        meshes: The meshes.
+        colors: The colours of each mesh's vertices, float [V, 3] in 0..1.
+    """
 
     meshes: list[Mesh]
     colors: list[np.ndarray]
 
 
 class Picture(NamedTuple):
-    """A row on white: for each view an image, uint8 [640, W, 3]; and where the middle of each mesh
-    is in all of them, as a share of the width."""
+    """The render of a row.
+
+    Attributes:
+        images: For each view an image with a white background, uint8 [640, W, 3].
+        middles: Horizontal position of each mesh's centre over the width of an image, float64 [M].
+    """
 
     images: list[np.ndarray]
     middles: np.ndarray
 
 
 def render(rows: list[Row], up: str, views: tuple[str, ...] = VIEWS) -> list[Picture]:
-    """up: the axis that points up, "y" (the front is then +z) or "z" (-y).
+    """Render rows of meshes. Needs an OpenGL library, but no display.
 
-    No display is needed, but an OpenGL library is. Errors: RenderError without one.
+    Args:
+        rows: What to show.
+        up: The axis that points up: "y", and the front faces +z; or "z", and the front faces -y.
+        views: "front" and "back", or one of them.
+
+    Returns:
+        A picture for each row.
+
+    Raises:
+        RenderError: VTK finds no OpenGL library.
     """
-    # VTK ends the whole process where it finds no OpenGL: so it has one of its own
-    context, ignore = get_context("spawn"), (signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for ours
+    # Without OpenGL, VTK crashes its process; so it gets one of its own, which ignores Ctrl-C.
+    context, ignore = get_context("spawn"), (signal.SIGINT, signal.SIG_IGN)
     with ProcessPoolExecutor(1, context, initializer=signal.signal, initargs=ignore) as process:
         try:
             return process.submit(_render, rows, up, views).result()
         except (BrokenProcessPool, ImportError) as error:
             raise RenderError(
-                "VTK could not draw; it needs an OpenGL library (on Debian: libegl1, libgl1)"
+                "VTK failed; it needs an OpenGL library (on Debian: libegl1, libgl1)"
             ) from error
 
 
 def upright(vertices: np.ndarray, up: str, view: str = "front") -> np.ndarray:
-    """float64 [V, 3]: turned so that y is up and z comes towards who looks at that view."""
+    """Vertices rotated into a view, with x to the right, y up and z towards the viewer.
+
+    Args:
+        vertices: float [V, 3].
+        up: The axis that points up, "y" or "z".
+        view: "front" or "back".
+
+    Returns:
+        float64 [V, 3].
+    """
     x, y, z = vertices.astype(np.float64).T
     if up == "z":
         y, z = z, -y
@@ -67,10 +94,11 @@ def _render(rows, up, views):
 def _render_row(meshes, colors, up, views):
     if sys.platform == "linux" and "DISPLAY" not in os.environ:
         os.environ.setdefault("VTK_DEFAULT_OPENGL_WINDOW", "vtkEGLRenderWindow")
-    import pyvista  # takes seconds
+    import pyvista  # slow to import
 
     sizes = [np.ptp(upright(mesh.vertices, up), axis=0) for mesh in meshes]
-    tall = max(max(size[1], 0.05 * size[0]) for size in sizes)  # of a flat one, a line
+    # a mesh that is flat in this view has no height
+    tall = max(max(size[1], 0.05 * size[0]) for size in sizes)
     gap = 0.08 * tall
     middles, left = [], gap
     for size in sizes:

@@ -1,31 +1,42 @@
-"""Bodies that come with the repository: FAUST's shape without its registration."""
+"""The bundled human bodies: a data set like FAUST that needs no registration."""
 
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
+from pydantic import Field
 
+from meshspiral.data.settings import DataSettings
 from meshspiral.data.shapes import DataError, Shape, ShapeSet, registered_shape, subject_split
 from meshspiral.geometry.mesh import Mesh
 
 SIZES = (1500, 6890)
 
 
-class Bodies(ShapeSet):
-    """100 registered human bodies, 10 subjects in 10 poses, in metres; see NOTICE.
+class Bodies(ShapeSet, name="bodies"):
+    """100 registered human bodies, 10 subjects in 10 poses, in metres (source: see NOTICE).
 
-    In FAUST's order (shape i shows subject i // 10 in pose i % 10) and split as the paper splits
-    FAUST. All have the template's connectivity and are closed 2-manifolds of genus 0; a label is a
-    vertex number. vertices: 1500, or 6890 with FAUST's 13,776 faces. The two sizes show the same
-    bodies. Errors: DataError for any other size.
+    Order and split are those of FAUST: shape i shows subject i // 10 in pose i % 10. All bodies
+    have the template's connectivity, so vertex i has label i, and are closed 2-manifolds of
+    genus 0. Both sizes show the same bodies.
+
+    Args:
+        vertices: 1500, or 6890 with 13,776 faces, as in FAUST.
+
+    Raises:
+        DataError: There is no such size.
     """
 
     up = "z"
 
+    class Settings(DataSettings):
+        vertices: Literal[1500, 6890] = Field(description="vertices of the template and the bodies")
+
     def __init__(self, vertices: int = 1500) -> None:
         if vertices not in SIZES:
-            raise DataError(f"vertices: the bodies come with 1500 or 6890, got {vertices!r}")
+            raise DataError(f"vertices must be 1500 or 6890, got {vertices!r}")
         path = Path(__file__).parents[1] / "assets" / f"bodies_{int(vertices)}.npz"
         with np.load(path, allow_pickle=False) as file:
             arrays = dict(file)
@@ -37,9 +48,15 @@ class Bodies(ShapeSet):
 
     def load(self, name: str) -> Shape:
         if name not in self._grid:
-            raise DataError(f"no body is called {name!r}; the first is {next(iter(self._grid))!r}")
+            raise DataError(f"no body is named {name!r}; the first is {next(iter(self._grid))!r}")
         return registered_shape(self._mesh(name, self._grid[name]), self.template)
 
     def _mesh(self, name: str, grid: np.ndarray) -> Mesh:
-        """grid: uint16 [V, 3], steps of at most 0.04 mm from the corner of the set's box."""
+        """The mesh of quantised coordinates.
+
+        Args:
+            name: Name of the mesh.
+            grid: Coordinates in steps of at most 0.04 mm from the lower corner of the bounding box
+                of all bodies, uint16 [V, 3].
+        """
         return Mesh(self._offset + grid * self._scale, self._faces, name)

@@ -1,4 +1,4 @@
-"""FAUST's 100 registrations (Bogo et al. 2014), from the folder or straight from the zip."""
+"""FAUST's 100 registrations (Bogo et al. 2014), read from the folder or from the zip archive."""
 
 from __future__ import annotations
 
@@ -9,27 +9,42 @@ from collections.abc import Iterable
 from functools import cached_property
 from pathlib import Path, PurePosixPath
 
+from pydantic import Field
+
+from meshspiral.data.mesh_files import parse_mesh, read_mesh
+from meshspiral.data.settings import DataSettings, Text
 from meshspiral.data.shapes import DataError, Shape, ShapeSet, registered_shape, subject_split
-from meshspiral.geometry.mesh import Mesh, parse_mesh, read_mesh
+from meshspiral.geometry.mesh import Mesh
 
 NAMES = [f"tr_reg_{i:03d}" for i in range(100)]
 _REGISTRATION = re.compile(r"((?:[^/]+/)?training/registrations/)(tr_reg_\d{3})\.ply")
 _HELP = (
-    "FAUST's owners give it to whoever registers at https://faust-leaderboard.is.tuebingen.mpg.de "
-    "(see also http://faust.is.tue.mpg.de); then pass data.root=/path/to/MPI-FAUST or "
-    "data.root=/path/to/MPI-FAUST.zip. data=bodies_6890 has the same shape (100 meshes of 6890 "
-    "vertices, 10 people in 10 poses) and needs no registration."
+    "FAUST is available after registration at https://faust-leaderboard.is.tuebingen.mpg.de "
+    "(see also http://faust.is.tue.mpg.de); then set data.root=/path/to/MPI-FAUST or "
+    "data.root=/path/to/MPI-FAUST.zip. Without registration, use data=bodies_6890: 100 meshes of "
+    "6890 vertices, also of 10 people in 10 poses."
 )
 
 
-class Faust(ShapeSet):
+class Faust(ShapeSet, name="faust"):
     """The registrations tr_reg_000 .. tr_reg_099 of MPI-FAUST: 6890 vertices, one connectivity.
 
-    root: the extracted MPI-FAUST folder, a folder that contains it, or MPI-FAUST.zip, which is read
-    in place. Shape i shows subject i // 10 in pose i % 10. tr_reg_000 is the template, and a label
-    is a vertex number. Errors: DataError where the data are missing, incomplete or damaged, or a
-    mesh has not the template's number of vertices; MeshError where one cannot be used.
+    Shape i shows subject i // 10 in pose i % 10. The template is tr_reg_000. Vertex i has label i.
+
+    Args:
+        root: The extracted MPI-FAUST folder, a folder that contains it, or MPI-FAUST.zip, which is
+            read without extracting it.
+
+    Raises:
+        DataError: The data are missing, incomplete or damaged. When a shape is loaded: it does not
+            have the template's number of vertices.
+        MeshError: When a shape is loaded: its mesh is unusable.
     """
+
+    class Settings(DataSettings):
+        root: Text | None = Field(
+            description="the extracted MPI-FAUST, a folder that contains it, or MPI-FAUST.zip"
+        )
 
     def __init__(self, root: str | Path | None) -> None:
         if not root:
@@ -50,7 +65,7 @@ class Faust(ShapeSet):
 
     def load(self, name: str) -> Shape:
         if name not in NAMES:
-            raise DataError(f"no registration is called {name!r}: {NAMES[0]} .. {NAMES[-1]}")
+            raise DataError(f"name must be one of {NAMES[0]} .. {NAMES[-1]}, got {name!r}")
         return registered_shape(self._read(name), self.template)
 
     def _read(self, name: str) -> Mesh:
@@ -60,13 +75,13 @@ class Faust(ShapeSet):
         try:
             with zipfile.ZipFile(self._root) as archive:
                 data = archive.read(file)
-        except Exception as error:  # zlib, lzma, CRC, encryption: whatever a damaged archive raises
-            raise _unusable(f"{self._root}: {file} cannot be unpacked ({error})") from error
+        except Exception as error:  # a damaged archive raises zlib, lzma, CRC errors, ...
+            raise _unusable(f"{self._root}: cannot extract {file} ({error})") from error
         return parse_mesh(data, ".ply", f"{self._root}:{file}")
 
 
 def _registrations(root: Path) -> dict[str, str]:
-    """For each registration found its path inside root, a folder or an archive."""
+    """The path of each registration inside `root`, a folder or a zip archive, by name."""
     if root.is_dir():
         patterns = ("training/registrations/*.ply", "*/training/registrations/*.ply")
         paths = [path for pattern in patterns for path in root.glob(pattern)]
@@ -80,14 +95,17 @@ def _registrations(root: Path) -> dict[str, str]:
         raise _unusable(f"{root} is neither a folder nor an intact zip ({error})") from error
     except OSError as error:
         raise _unusable(f"{root} cannot be read ({error.strerror or error})") from error
-    for name in names:  # none is ever written, but such an archive is not what it says
+    for name in names:  # nothing is extracted, but such an archive is not FAUST
         if name.startswith("/") or ".." in PurePosixPath(name.replace("\\", "/")).parts:
-            raise _unusable(f"{root} holds {name!r}, which leads out of it")
+            raise _unusable(f"{root} contains the path {name!r}, which points outside the archive")
     return _most_complete(names)
 
 
 def _most_complete(paths: Iterable[str]) -> dict[str, str]:
-    """The registrations of one folder: two copies, one of them partial, are never mixed."""
+    """The registrations of the most complete folder; copies in several folders are never mixed.
+
+    Of equally complete folders, the first by name is taken.
+    """
     folders: dict[str, dict[str, str]] = defaultdict(dict)
     for path in sorted(paths):
         if match := _REGISTRATION.fullmatch(path):
@@ -95,5 +113,5 @@ def _most_complete(paths: Iterable[str]) -> dict[str, str]:
     return max(folders.values(), key=lambda files: len(files.keys() & set(NAMES)), default={})
 
 
-def _unusable(found: str) -> DataError:
-    return DataError(f"FAUST (100 registered scans of people, Bogo et al. 2014): {found}. {_HELP}")
+def _unusable(reason: str) -> DataError:
+    return DataError(f"FAUST (100 registered scans of people, Bogo et al. 2014): {reason}. {_HELP}")

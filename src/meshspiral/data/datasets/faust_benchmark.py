@@ -1,4 +1,4 @@
-"""Trained on FAUST's connectivity, tested on others: N. Sharp's remeshed FAUST."""
+"""FAUST for training and its remeshed test shapes by N. Sharp for testing."""
 
 from __future__ import annotations
 
@@ -6,34 +6,62 @@ import logging
 import re
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Literal
+
+from pydantic import Field
 
 from meshspiral.data.datasets.faust import Faust
 from meshspiral.data.datasets.folder import find_meshes
+from meshspiral.data.mesh_files import read_mesh
+from meshspiral.data.settings import DataSettings, Text
 from meshspiral.data.shapes import DataError, Shape, ShapeSet, read_labels
-from meshspiral.geometry.mesh import Mesh, read_mesh
+from meshspiral.geometry.mesh import Mesh
 
 log = logging.getLogger(__name__)
 
 POLICIES = ("iso", "qes", "mc", "dense")
 _HELP = (
     "The benchmark (remeshed test shapes of FAUST) is public: git clone "
-    "https://github.com/nmwsharp/discretization-robust-correspondence-benchmark and pass "
+    "https://github.com/nmwsharp/discretization-robust-correspondence-benchmark and set "
     "data.benchmark_root=/path/to/discretization-robust-correspondence-benchmark."
 )
 
 
-class FaustBenchmark(ShapeSet):
-    """FAUST's registrations to train and validate on, the benchmark's meshes to test on.
+class FaustBenchmark(ShapeSet, name="faust_benchmark"):
+    """FAUST's registrations for training and validation, the benchmark's meshes for testing.
 
-    root: as for `Faust`. benchmark_root: the benchmark's repository or its data folder.
-    policy: how the test meshes were made: "iso", "qes", "mc" or "dense". Their labels are the
-    nearest vertices of the template, read from the `.txt` beside each mesh.
-    train: None for the registrations of subjects 0-6, or meshes of the benchmark's layout as in
-    `find_meshes`, relative to its data folder. As published it shows subjects 8 and 9 alone: train
-    on 080-089, say, and what is left to test are 090-099. A subject that is trained on is neither
-    validated nor tested on, and the log says so.
-    Errors: DataError, also if nothing is left to test; MeshError for a mesh that cannot be used.
+    The labels of a test mesh are the nearest vertices of the template, read from the `.txt` file
+    beside the mesh. A subject that is trained on is left out of validation and test, with a
+    warning.
+
+    Args:
+        root: As for `Faust`.
+        benchmark_root: The benchmark's repository or its data folder.
+        policy: How the test meshes were remeshed: "iso", "qes", "mc" or "dense".
+        train: Training meshes in the benchmark's layout, as entries of `find_meshes` relative to
+            its data folder; None for FAUST's registrations of subjects 0-6. The published benchmark
+            contains only subjects 8 and 9: training on meshes 080-089, for example, leaves 090-099
+            for testing.
+
+    Raises:
+        DataError: Data are missing or invalid, or no shape is left for validation or test.
+        MeshError: When a shape is loaded: its mesh is unusable.
     """
+
+    class Settings(DataSettings):
+        root: Text | None = Field(
+            description="the extracted MPI-FAUST, a folder that contains it, or MPI-FAUST.zip"
+        )
+        benchmark_root: Text | None = Field(
+            description="the benchmark's repository or its data folder"
+        )
+        policy: Literal["iso", "qes", "mc", "dense"] = Field(
+            description="how the test meshes were remeshed"
+        )
+        train: list[Text] | None = Field(
+            description="meshes of the benchmark to train on, names or patterns; null: FAUST's "
+            "registrations of subjects 0 to 6"
+        )
 
     def __init__(
         self,
@@ -43,7 +71,7 @@ class FaustBenchmark(ShapeSet):
         train: str | Sequence[str] | None = None,
     ) -> None:
         if policy not in POLICIES:
-            raise DataError(f"policy must be one of {', '.join(POLICIES)}; got {policy!r}")
+            raise DataError(f"policy must be one of {', '.join(POLICIES)}, got {policy!r}")
         self._faust = Faust(root)
         data = _data_folder(benchmark_root, policy)
         names = [f"tr_reg_{policy}_{i:03d}" for i in range(80, 100)]
@@ -55,22 +83,22 @@ class FaustBenchmark(ShapeSet):
             for name, mesh in zip(self.names["train"], meshes, strict=True):
                 if self._files.setdefault(name, mesh) != mesh:
                     raise DataError(f"train: {self._files[name]} and {mesh} have the same name")
-            self._leave_out({_number(mesh.stem, mesh) // 10 for mesh in meshes})
+            self._exclude({_number(mesh.stem, mesh) // 10 for mesh in meshes})
         files = [f for mesh in self._files.values() for f in (mesh, mesh.with_suffix(".txt"))]
         missing = [file for file in files if not file.is_file()]
         if missing:
-            raise DataError(f"{len(missing)} files are missing, the first {missing[0]}. {_HELP}")
+            raise DataError(f"{len(missing)} files are missing; the first is {missing[0]}. {_HELP}")
 
-    def _leave_out(self, subjects: set[int]) -> None:
-        """Take subjects that are trained on out of validation and test."""
+    def _exclude(self, subjects: set[int]) -> None:
+        """Remove shapes of these subjects from validation and test."""
         for split in ("val", "test"):
             names = self.names[split]
             left = [name for name in names if _number(name, name) // 10 not in subjects]
             if not left:
-                raise DataError(f"train: shows all subjects there are for {split}; leave one out")
+                raise DataError(f"train contains every subject of {split}; leave one of them out")
             if len(left) < len(names):
                 log.warning(
-                    "%d of %d shapes for %s show a subject that is trained on; left out",
+                    "%d of %d %s shapes show a training subject and are left out",
                     len(names) - len(left),
                     len(names),
                     split,
@@ -96,11 +124,12 @@ def _data_folder(benchmark_root: str | Path | None, policy: str) -> Path:
     for data in (root / "data", root):
         if (data / policy).is_dir():
             return data
-    raise DataError(f"{root} holds neither data/{policy} nor {policy}. {_HELP}")
+    raise DataError(f"{root} contains neither data/{policy} nor {policy}. {_HELP}")
 
 
-def _number(stem: str, shown: str | Path) -> int:
+def _number(stem: str, source: str | Path) -> int:
+    """The number in a name such as tr_reg_iso_085; `source` is what an error message names."""
     match = re.fullmatch(r"tr_reg_(?:[a-z]+_)?(\d{3})", stem)
     if match is None:
-        raise DataError(f"train: {shown} is not called tr_reg_<policy>_<number>")
+        raise DataError(f"train: the name of {source} must be tr_reg_<policy>_<number>")
     return int(match[1])

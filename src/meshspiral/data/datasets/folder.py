@@ -1,25 +1,60 @@
-"""Your own registered meshes: a folder, a template, and a split that you write down."""
+"""Meshes in a folder of your own, with a template, label files and a split."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import cached_property
 from pathlib import Path, PurePath
+from typing import Annotated, Any
 
+from pydantic import BeforeValidator, Field
+
+from meshspiral.data.mesh_files import SUFFIXES, read_mesh
+from meshspiral.data.settings import DataSettings, Text
 from meshspiral.data.shapes import SPLITS, DataError, Shape, ShapeSet, read_labels, registered_shape
-from meshspiral.geometry.mesh import SUFFIXES, Mesh, read_mesh
+from meshspiral.geometry.mesh import Mesh
 
 
-class Folder(ShapeSet):
-    """Meshes in a folder, each with a file that says which template vertex its vertices match.
+def _files(value: Any) -> Any:
+    many = isinstance(value, list) and all(isinstance(name, str) for name in value)
+    if not (value is None or isinstance(value, str) or many):
+        raise ValueError("must be file names or patterns")
+    return value
 
-    root: the folder. template: a mesh file in it. train, val, test: as in `find_meshes`.
-    labels: a mesh's label file, relative to the mesh's own folder, with {stem} for the mesh's name
-    without suffix (see `read_labels`); "identity" or None where every mesh has the template's
-    vertices in the template's order. A shape is called after its path in root, without suffix and
-    with "_" for "/". Errors: DataError where a file is missing or outside root, where two meshes
-    would have one name, or where a mesh stands in two splits.
+
+Files = Annotated[Any, BeforeValidator(_files)]
+
+
+class Folder(ShapeSet, name="folder"):
+    """Meshes in a folder, each with a file of labels: the template vertices of its vertices.
+
+    The name of a shape is its path relative to `root`, without suffix and with "_" for "/".
+
+    Args:
+        root: The folder.
+        template: A mesh file in the folder.
+        train: Training meshes, as entries of `find_meshes`.
+        val: Validation meshes, likewise.
+        test: Test meshes, likewise.
+        labels: Label file of a mesh (see `read_labels`), relative to the folder of the mesh;
+            "{stem}" stands for the mesh's file name without suffix. "identity" or None if every
+            mesh has the template's vertices in the template's order.
+
+    Raises:
+        DataError: A file is missing or outside `root`, two meshes would have the same name, or a
+            mesh is in two splits.
     """
+
+    class Settings(DataSettings):
+        root: Text | None = Field(description="folder to which all other paths are relative")
+        template: Text | None = Field(description="mesh file whose vertices are the labels")
+        train: Files = Field(description="training meshes: names and patterns, or a .txt of them")
+        val: Files = Field(description="validation meshes, likewise")
+        test: Files = Field(description="test meshes, likewise")
+        labels: Text | None = Field(
+            description="label file of a mesh, relative to the mesh's folder, {stem} is its name "
+            "without suffix; identity: label i for vertex i"
+        )
 
     def __init__(
         self,
@@ -32,15 +67,17 @@ class Folder(ShapeSet):
     ) -> None:
         if not root or not template:
             raise DataError(
-                "a folder of your own meshes needs data.root=/path/to/folder and "
-                f"data.template=a mesh file in it, got root={root!r}, template={template!r}"
+                "a folder of meshes needs data.root=/path/to/folder and data.template=a mesh "
+                f"file in it, got data.root={root!r} and data.template={template!r}"
             )
         root = Path(root).expanduser()
         if not root.is_dir():
-            raise DataError(f"data.root: {root} is not a folder")
+            raise DataError(f"data.root must be a folder, got {root}")
         templates = find_meshes(root, [template])
         if len(templates) != 1:
-            raise DataError(f"data.template: {template!r} matches {len(templates)} meshes, not one")
+            raise DataError(
+                f"data.template must match one mesh; {template!r} matches {len(templates)} meshes"
+            )
         self._template = templates[0]
         self._meshes: dict[str, Path] = {}
         self._labels: dict[str, Path | None] = {}
@@ -50,10 +87,12 @@ class Folder(ShapeSet):
             for mesh in find_meshes(root, entries):
                 other = owner.setdefault(mesh.resolve(), split)
                 if other != split:
-                    raise DataError(f"{mesh} is in {other} and in {split}; a mesh has one split")
+                    raise DataError(
+                        f"{mesh} is in {other} and in {split}; a mesh must be in one split only"
+                    )
                 name = "_".join(mesh.relative_to(root).with_suffix("").parts)
                 if name in self._meshes:
-                    raise DataError(f"{self._meshes[name]} and {mesh} would both be called {name}")
+                    raise DataError(f"{self._meshes[name]} and {mesh} would both be named {name}")
                 self._meshes[name] = mesh
                 self._labels[name] = _label_file(root, mesh, labels)
                 self.names[split].append(name)
@@ -66,7 +105,7 @@ class Folder(ShapeSet):
 
     def load(self, name: str) -> Shape:
         if name not in self._meshes:
-            raise DataError(f"no mesh is called {name!r}; the first is {next(iter(self._meshes))}")
+            raise DataError(f"no mesh is named {name!r}; the first is {next(iter(self._meshes))}")
         mesh, labels = read_mesh(self._meshes[name]), self._labels[name]
         if labels is None:
             return registered_shape(mesh, self.template)
@@ -75,13 +114,17 @@ class Folder(ShapeSet):
 
 
 def find_meshes(root: Path, entries: str | Sequence[str] | None) -> list[Path]:
-    """The mesh files that `entries` name, each below root, without duplicates.
+    """The mesh files that `entries` name, in the order of the entries and without duplicates.
 
-    entries: file names or glob patterns relative to root, or the path of a `.txt` (absolute, or
-    relative to root) with one of these a line; None for no meshes. They are taken in their order,
-    a pattern's matches sorted; a pattern leaves out hidden files and files that are no meshes.
-    Errors: DataError for an entry that matches no mesh or leads out of root: an absolute path,
-    "..", a symbolic link.
+    Args:
+        root: The folder that contains all meshes.
+        entries: File names or glob patterns relative to `root`; or the path of a `.txt` file
+            (absolute, or relative to `root`) with one of these per line; None for no meshes. The
+            matches of a pattern are sorted; hidden files and files that are not meshes are skipped.
+
+    Raises:
+        DataError: An entry matches no mesh or points outside `root`: by an absolute path, "..", or
+            a symbolic link.
     """
     if isinstance(entries, str):
         entries = _lines(root / entries) if entries.endswith(".txt") else [entries]
@@ -95,13 +138,13 @@ def find_meshes(root: Path, entries: str | Sequence[str] | None) -> list[Path]:
 
 
 def _matches(root: Path, entry: str) -> list[Path]:
-    if (root / entry).is_file():  # a name may hold brackets that a pattern would read as its own
+    if (root / entry).is_file():  # before glob: a file name may contain brackets
         matches = [root / entry]
     else:
         try:
             matches = sorted(path for path in root.glob(entry) if not path.name.startswith("."))
         except (ValueError, IndexError, NotImplementedError) as error:
-            raise DataError(f"{entry!r} is no file or pattern that I can look for") from error
+            raise DataError(f"{entry!r} is neither a file nor a valid glob pattern") from error
     meshes = [path for path in matches if path.suffix.lower() in SUFFIXES and path.is_file()]
     if not meshes:
         raise DataError(f"{root}: {entry!r} matches no mesh file ({', '.join(SUFFIXES)})")
@@ -109,10 +152,10 @@ def _matches(root: Path, entry: str) -> list[Path]:
 
 
 def _inside(root: Path, path: Path) -> Path:
-    """The real path of a file that must lie in root."""
+    """The resolved path of a file, which must be inside `root`."""
     real = path.resolve()
     if not real.is_relative_to(root.resolve()):
-        raise DataError(f"{path} leads out of {root}, to {real}")
+        raise DataError(f"{path} must be inside {root}, but is a path to {real}")
     return real
 
 
@@ -121,7 +164,9 @@ def _label_file(root: Path, mesh: Path, labels: str | None) -> Path | None:
         return None
     path = mesh.parent / labels.replace("{stem}", mesh.stem)
     if not path.is_file():
-        raise DataError(f"{path}: {mesh.name} needs this label file (data.labels={labels!r})")
+        raise DataError(
+            f"{path} does not exist; {mesh.name} needs this label file (data.labels={labels!r})"
+        )
     _inside(root, path)
     return path
 

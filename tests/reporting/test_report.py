@@ -1,4 +1,4 @@
-"""The report: which runs stand together, what its tables and its page hold, what it leaves out."""
+"""Reports: groups of runs, compared curves, tables, the page, and omitted runs."""
 
 from __future__ import annotations
 
@@ -15,14 +15,15 @@ import numpy as np
 import pytest
 import trimesh
 
-from meshspiral.commands.report import beside, file_name, main
-from meshspiral.experiment.runs import CONFIG, METRICS
-from meshspiral.reporting.groups import arrangements, collect, grouped, varied
+from meshspiral.commands.report import main
+from meshspiral.evaluation.run_folder import CONFIG, METRICS
+from meshspiral.nn.networks import FCSNet, Network
+from meshspiral.reporting.groups import data_labels, group_runs, length_keys, varied_settings
+from meshspiral.reporting.plots import compared_curves, file_name
+from meshspiral.reporting.runs import Run, common_folder, read_runs
 from meshspiral.reporting.tables import run_table
-from tests.commands.test_train import run
 from tests.conftest import toy_shapes
-from tests.data.test_remeshed import REMESH
-from tests.experiment.test_cli import QUICK, cli  # noqa: F401
+from tests.helpers import QUICK, run
 
 SWEEP = {
     "fcs5": ["seq_len=5"],
@@ -31,8 +32,11 @@ SWEEP = {
     "fcs5_metric": ["seq_len=5", "metric=true"],
     "lstm5": ["model=lstm", "seq_len=5"],
     "fcs6_metric": ["seq_len=6", "metric=true"],
-    "gcnn3": ["model=gcnn3", "model.patch.radius=0.2", "optim.lr=0.002"],
+    "gcnn3": ["model=gcnn3", "neighbourhood.radius=0.2", "optim.lr=0.002"],
 }
+
+
+REMESH = ["data.remesh={policy: mixed, vertices: 120, copies: 1}"]
 
 
 @pytest.fixture(scope="module")
@@ -69,20 +73,29 @@ class Page(HTMLParser):
             self.data += data
 
 
+def changed(run: Run, **groups: dict) -> Run:
+    """The run with other settings: changed(run, optim={"lr": 1.0}, seed=2)."""
+    values = {}
+    for key, value in groups.items():
+        group = getattr(run.config, key)
+        values[key] = group.model_copy(update=value) if isinstance(value, dict) else value
+    return replace(run, config=run.config.model_copy(update=values))
+
+
 def test_runs_that_differ_in_the_seed_alone_are_one_group(sweep):
-    runs, broken = collect(str(sweep))
-    assert len(runs) == 7 and broken == []
-    groups = grouped(runs)
+    runs, omitted = read_runs(str(sweep))
+    assert len(runs) == 7 and omitted == []
+    groups = group_runs(runs)
     assert sorted(len(group.runs) for group in groups) == [1, 1, 1, 1, 1, 2]
     [pair] = [group for group in groups if len(group.runs) == 2]
     assert {r.folder.name for r in pair.runs} == {"fcs5", "fcs5_again"}
     assert pair.curves.shape[0] == 2
-    assert varied(runs) == ["optim.lr"]
+    assert varied_settings(runs) == ["optim.lr"]
 
 
-def test_the_paper_s_arrangements_are_found(sweep):
-    groups = grouped(collect(str(sweep))[0])
-    found = {title: list(curves) for title, curves in arrangements(groups)}
+def test_the_comparisons_of_the_paper_are_found(sweep):
+    groups = group_runs(read_runs(str(sweep))[0])
+    found = {title: list(curves) for title, curves in compared_curves(groups)}
     networks = found["Networks at N = 5 without metric information, folder"]
     assert sorted(networks) == ["FCS-NET, lr 0.004", "GCNN3, lr 0.002", "LSTM-NET, lr 0.004"]
     lengths = [v for k, v in found.items() if k.startswith("Lengths of FCS-NET")]
@@ -92,25 +105,25 @@ def test_the_paper_s_arrangements_are_found(sweep):
     assert not any("LSTM" in title for title in found)
 
 
-def test_the_report_is_one_page_with_tables_and_figures(cli, sweep, tmp_path):  # noqa: F811
+def test_a_report_has_a_page_tables_and_plots(cli, sweep, tmp_path):
     code, out, err = cli(f"runs={sweep}", "output=report", "shapes=2", program=main)
     assert code == 0, err
-    assert "7 runs, 0 left out" in out
+    assert "Runs:    7, 0 omitted" in out
     folder = tmp_path / "report"
     text = (folder / "index.html").read_text()
     page = Page(text)
     addresses = [v for _, a in page.attributes for k, v in a.items() if k in ("src", "href")]
     assert [a for a in addresses if not a.startswith(("data:", "#"))] == []  # needs no network
-    columns, _ = run_table(grouped(collect(str(sweep))[0]))
+    columns, _ = run_table(group_runs(read_runs(str(sweep))[0]))
     assert page.rows[0] == columns and len(page.rows) == 1 + 7 + 1 + 1  # one group has two seeds
     assert "±" in " ".join(page.rows[-1])
     with open(folder / "table.csv") as file:
         table = list(csv.reader(file))
     assert table[0] == columns and len(table) == 8
-    kept = {row[-1]: row for row in table[1:]}
+    rows = {row[-1]: row for row in table[1:]}
     for name in SWEEP:
         metrics = json.loads((sweep / name / METRICS).read_text())
-        row = dict(zip(columns, kept[str(sweep / name)], strict=True))
+        row = dict(zip(columns, rows[str(sweep / name)], strict=True))
         assert float(row["exact match (%)"]) == pytest.approx(100 * metrics["test/exact_match"])
         assert int(float(row["parameters"])) == metrics["parameters"]
     assert len(list(folder.glob("*.pdf"))) == text.count("<figcaption>") == 9
@@ -119,13 +132,13 @@ def test_the_report_is_one_page_with_tables_and_figures(cli, sweep, tmp_path):  
     body = [line for line in tex.splitlines() if line.endswith(r"\\")]
     assert len(body) == 7 and len({line.count("&") for line in body}) == 1
     assert r"$\pm$" in tex and "_" not in tex.replace(r"\_", "")
-    marked = (folder / "table.md").read_text().splitlines()
-    assert len(marked) == 2 + 6 and len({line.count("|") for line in marked}) == 1
-    [pair] = [line for line in marked if "±" in line]
+    markdown = (folder / "table.md").read_text().splitlines()
+    assert len(markdown) == 2 + 6 and len({line.count("|") for line in markdown}) == 1
+    [pair] = [line for line in markdown if "±" in line]
     assert pair.startswith("| FCS-NET | 5 | no | folder | 2 | 0.004 |")
 
 
-def test_the_shapes_of_the_page_are_those_of_the_data_set(cli, sweep, tmp_path):  # noqa: F811
+def test_the_shapes_of_the_page_are_those_of_the_data_set(cli, sweep, tmp_path):
     cli(f"runs={sweep}", "output=report", "shapes=2", program=main)
     data = json.loads(Page((tmp_path / "report/index.html").read_text()).data)
     scenes, surfaces = data["scenes"], data["surfaces"]
@@ -147,10 +160,10 @@ def test_the_shapes_of_the_page_are_those_of_the_data_set(cli, sweep, tmp_path):
     assert labels.tolist() == list(range(162))
 
 
-def test_remeshed_shapes_are_surfaces_of_their_own(cli, toy_overrides, tmp_path):  # noqa: F811
+def test_remeshed_shapes_are_surfaces_of_their_own(cli, toy_overrides, tmp_path):
     run(tmp_path / "run", [*toy_overrides, *REMESH, "optim.epochs=1"])
     code, out, err = cli("runs=run", "shapes=2", program=main)
-    assert code == 0 and "no view" not in out, err
+    assert code == 0 and "cannot show" not in out, err
     [row] = csv.reader((tmp_path / "run/report/table.csv").read_text().splitlines()[1:])
     assert row[0] == "FCS-NET" and row[3] == "folder mixed"
     data = json.loads(Page((tmp_path / "run/report/index.html").read_text()).data)
@@ -161,7 +174,7 @@ def test_remeshed_shapes_are_surfaces_of_their_own(cli, toy_overrides, tmp_path)
         assert len(points) == 3 * 4 * sizes[scene["name"]]
 
 
-def test_broken_runs_are_named_and_the_others_shown(cli, sweep, tmp_path):  # noqa: F811
+def test_unreadable_runs_are_listed_and_the_others_shown(cli, sweep, tmp_path):
     copy = Path(shutil.copytree(sweep, tmp_path / "copy"))
     (copy / "fcs6" / METRICS).write_text('{"test/exact_match": 0.')
     (copy / "lstm5" / METRICS).unlink()
@@ -169,22 +182,22 @@ def test_broken_runs_are_named_and_the_others_shown(cli, sweep, tmp_path):  # no
     (copy / "fcs5_metric" / CONFIG).write_text("of: another program")
     code, out, err = cli("runs=copy", "shapes=0", program=main)
     assert code == 0, err
-    assert "3 runs, 4 left out" in out
+    assert "Runs:    3, 4 omitted" in out
     text = (copy / "report" / "index.html").read_text()
     reasons = {
         "fcs6": "metrics.json is damaged",
         "lstm5": "not finished",
-        "gcnn3": "no config",
-        "fcs5_metric": "no config of a run",
+        "gcnn3": "is not the config of a run",
+        "fcs5_metric": "is not the config of a run",
     }
     for name, reason in reasons.items():
         assert re.search(rf"copy/{name}\b.*{reason}", text)
-        assert re.search(rf"left out: copy/{name}\b.*{reason}", out)
-    code, out, _ = cli("runs=copy", "shapes=0", program=main)  # its own folder is no run
-    assert code == 0 and "3 runs, 4 left out" in out
+        assert re.search(rf"omitted: copy/{name}\b.*{reason}", out)
+    code, out, _ = cli("runs=copy", "shapes=0", program=main)  # the report's folder is no run
+    assert code == 0 and "Runs:    3, 4 omitted" in out
 
 
-def test_without_the_data_set_all_but_the_shapes_is_there(cli, toy, toy_overrides, tmp_path):  # noqa: F811
+def test_without_the_data_set_only_the_shapes_are_missing(cli, toy, toy_overrides, tmp_path):
     here = Path(shutil.copytree(toy, tmp_path / "here"))
     overrides = [o.replace(str(toy), str(here)) for o in toy_overrides]
     run(tmp_path / "run", [*overrides, "optim.epochs=1"])
@@ -192,11 +205,12 @@ def test_without_the_data_set_all_but_the_shapes_is_there(cli, toy, toy_override
     code, out, err = cli("runs=run", program=main)
     assert code == 0, err
     page = (tmp_path / "run/report/index.html").read_text()
-    assert "no view of its shapes" in out and "no view of its shapes" in page
+    assert "run: cannot show its shapes (" in out
+    assert "run: cannot show its shapes (" in page
     assert json.loads(Page(page).data)["scenes"] == []
 
 
-def test_a_data_set_that_has_changed_is_not_drawn(cli, toy, toy_overrides, tmp_path):  # noqa: F811
+def test_shapes_of_a_data_set_that_changed_are_not_shown(cli, toy, toy_overrides, tmp_path):
     here = Path(shutil.copytree(toy, tmp_path / "here"))
     run(tmp_path / "run", [*(o.replace(str(toy), str(here)) for o in toy_overrides), *QUICK])
     for path in here.rglob("*.ply"):
@@ -204,20 +218,17 @@ def test_a_data_set_that_has_changed_is_not_drawn(cli, toy, toy_overrides, tmp_p
         mesh.export(path)
     code, out, err = cli("runs=run", program=main)
     assert code == 0, err
-    assert "has changed since" in out
+    assert "has changed since the test: other vertices or labels" in out
     page = (tmp_path / "run/report/index.html").read_text()
     assert json.loads(Page(page).data)["scenes"] == []
 
 
-def test_only_seeds_are_pooled(sweep, tmp_path):
-    """Other test shapes, another precision: another group. A repeated seed is one."""
-    runs, _ = collect(str(sweep / "fcs5"))
-    [one] = runs
+def test_only_seeds_are_pooled(sweep):
+    """Runs with other test shapes or precision are other groups; equal seeds count once."""
+    [one] = read_runs(str(sweep / "fcs5"))[0]
     other = replace(one, outcome=replace(one.outcome, labels=one.outcome.labels[::-1]))
-    exact = replace(
-        one, config=one.config | {"trainer": one.config["trainer"] | {"precision": "64"}}
-    )
-    groups = grouped([one, other, exact, one])
+    exact = changed(one, trainer={"precision": "64"})
+    groups = group_runs([one, other, exact, one])
     assert sorted(len(group.runs) for group in groups) == [1, 1, 2]
     assert all(group.seeds == {0} for group in groups)
     assert {group.label() for group in groups} == {
@@ -227,22 +238,75 @@ def test_only_seeds_are_pooled(sweep, tmp_path):
     }
 
 
+def test_settings_that_change_no_result_are_pooled(sweep):
+    [one] = read_runs(str(sweep / "fcs5"))[0]
+    other = changed(
+        one,
+        seed=1,
+        plugins=["my_package.spheres"],
+        picture=True,
+        resume="outputs/run",
+        trainer={"accelerator": "gpu", "threads": 7},
+        data={"cache_dir": "elsewhere", "workers": 7, "root": "elsewhere"},
+    )
+    [group] = group_runs([one, other])
+    assert group.seeds == {0, 1}
+
+
 def test_seeds_that_shuffle_vertices_are_pooled(sweep):
-    [one] = collect(str(sweep / "fcs5"))[0]
+    [one] = read_runs(str(sweep / "fcs5"))[0]
     shuffled = [
         replace(
-            one,
-            config=one.config
-            | {"seed": seed, "data": one.config["data"] | {"shuffle_vertices": True}},
+            changed(one, seed=seed, data={"shuffle_vertices": True}),
             outcome=replace(one.outcome, labels=np.roll(one.outcome.labels, seed)),
         )
         for seed in (0, 1)
     ]
-    [group] = grouped(shuffled)
+    [group] = group_runs(shuffled)
     assert group.seeds == {0, 1}
 
 
-def test_a_name_cannot_break_the_page(cli, sweep, tmp_path):  # noqa: F811
+def test_settings_of_a_neighbourhood_appear_under_its_name(sweep):
+    """Whole rings of spirals are a length; the rings of a patch are a setting like others."""
+    runs = {run.folder.name: run for run in read_runs(str(sweep))[0]}
+    spirals = [changed(runs["lstm5"], neighbourhood={"rings": rings}) for rings in (None, 1, 2)]
+    patches = [changed(runs["gcnn3"], neighbourhood={"rings": rings}) for rings in (3, 4)]
+    several = [*spirals, *patches]
+    assert length_keys(several) == {"spiral.rings"}
+    assert length_keys(list(runs.values())) == {"spiral.seq_len"}
+    assert varied_settings(several) == ["optim.lr", "patch.rings"]
+    assert [group.label("optim.lr") for group in group_runs(several)] == [
+        "GCNN3, folder, patch.rings 3",
+        "GCNN3, folder, patch.rings 4",
+        "LSTM-NET, 1 rings, folder",
+        "LSTM-NET, 2 rings, folder",
+        "LSTM-NET, N = 5, folder",
+    ]
+
+
+def test_a_network_without_sequences_ignores_the_root_seq_len(sweep):
+    [one] = read_runs(str(sweep / "gcnn3"))[0]
+    [group] = group_runs([one, changed(one, seq_len=30, seed=1)])
+    assert group.length is None and group.metric is None and group.label() == "GCNN3, folder"
+
+
+def test_networks_with_one_title_are_told_apart(sweep, monkeypatch):
+    monkeypatch.setattr(Network, "registered", {**Network.registered, "wide": FCSNet})
+    [one] = read_runs(str(sweep / "fcs5"))[0]
+    groups = group_runs([one, changed(one, model={"name": "wide"})])
+    assert [group.network for group in groups] == ["FCS-NET (fcs)", "FCS-NET (wide)"]
+
+
+def test_data_sets_of_one_name_are_told_apart_by_their_settings(sweep):
+    [one] = read_runs(str(sweep / "fcs5"))[0]
+    other = changed(one, data={"labels": "{stem}.txt"})
+    described = changed(one, data={"shot": one.config.data.shot.model_copy(update={"bins": 5})})
+    assert data_labels([one, other]) == ["folder identity", "folder {stem}.txt"]
+    assert data_labels([one, described]) == ["folder", "folder"]
+    assert varied_settings([one, described]) == ["data.shot.bins"]
+
+
+def test_a_name_cannot_break_the_page(cli, sweep, tmp_path):
     name = "<!--<script> [q] & it's 5 %"
     shutil.copytree(sweep / "fcs5", tmp_path / "odd" / name)
     shutil.copytree(sweep / "fcs6", tmp_path / "odd" / "b")
@@ -254,10 +318,10 @@ def test_a_name_cannot_break_the_page(cli, sweep, tmp_path):  # noqa: F811
     page = Page(text)
     assert name in {scene["run"] for scene in json.loads(page.data)["scenes"]}
     assert f"odd/{name}" in {row[-1] for row in page.rows if row}
-    assert collect(str(tmp_path / "odd" / name))[0]  # it is no pattern
+    assert read_runs(str(tmp_path / "odd" / name))[0]  # a folder, though it has wildcards
 
 
-def test_names_of_figures_are_short_and_their_own():
+def test_file_names_of_plots_are_short_and_differ():
     assert file_name("Lengths of FCS-NET++, a") != file_name("Lengths of FCS-NET, a")
     long = "x" * 300
     assert len(file_name(long)) < 120 and file_name(long) != file_name(long + "y")
@@ -266,19 +330,19 @@ def test_names_of_figures_are_short_and_their_own():
 @pytest.mark.parametrize(
     "arguments, message",
     [
-        ([], "runs= is missing: a folder with runs, or a pattern"),
+        ([], "runs= is missing: folder that contains runs at any depth, or a pattern"),
         (["runs=nowhere"], "runs=nowhere: there is no such folder"),
-        (["runs=."], "runs=.: holds no finished run"),
-        (["runs=.", "shapes=-1"], "shapes must be at least 0; got -1"),
+        (["runs=."], "runs=. contains no finished run"),
+        (["runs=.", "shapes=-1"], "shapes must be at least 0, got -1"),
     ],
 )
-def test_a_mistake_is_one_clear_line(cli, arguments, message):  # noqa: F811
+def test_a_mistake_is_one_clear_line(cli, arguments, message):
     code, out, err = cli(*arguments, program=main)
     assert code == 1
     assert message in (out + err).strip().splitlines()[-1]
 
 
-def test_a_report_lies_beside_its_runs():
-    assert beside("outputs/sweeps/a") == Path("outputs/sweeps/a")
-    assert beside("outputs/*/b") == Path("outputs")
-    assert beside("*") == Path()
+def test_a_report_is_written_beside_its_runs():
+    assert common_folder("outputs/sweeps/a") == Path("outputs/sweeps/a")
+    assert common_folder("outputs/*/b") == Path("outputs")
+    assert common_folder("*") == Path()

@@ -1,0 +1,45 @@
+"""Seconds of preprocessing: of one mesh on one core, and of a data set on all cores."""
+
+from __future__ import annotations
+
+import tempfile
+import time
+from collections.abc import Callable
+from functools import partial
+
+from meshspiral.benchmarking.inputs import first_body
+from meshspiral.benchmarking.measure import Row, medians
+from meshspiral.data.cache import Cache
+from meshspiral.data.preprocessing import Task, descriptor_task, neighbourhood_task, run_tasks
+from meshspiral.data.sources import open_shapes
+from meshspiral.experiment.schema import BenchmarkConfig, TrainConfig
+from meshspiral.geometry.mesh import Mesh
+from meshspiral.neighbourhoods import Neighbourhood
+
+
+def preprocessing_rows(config: BenchmarkConfig, networks: list[TrainConfig]) -> list[Row]:
+    """A row for the descriptors, for each neighbourhood of the networks, and for everything.
+
+    The last row is everything for all bodies, with all cores, from an empty cache.
+    """
+    data, makers = networks[0].data, dict[str, Callable[[Mesh], Task]]()
+    makers["shot"] = partial(descriptor_task, settings=data.shot)
+    for network in networks:
+        around = Neighbourhood.of(network.neighbourhood)
+        makers[around.title] = partial(neighbourhood_task, neighbourhood=around)
+    mesh = first_body(networks[0]).mesh
+    tasks = {name: make(mesh) for name, make in makers.items()}
+    seconds = medians(
+        {name: partial(task.compute, *task.arguments) for name, task in tasks.items()},
+        config.repeats,
+    )
+    rows: list[Row] = [{"what": name, "meshes": 1, "seconds": s} for name, s in seconds.items()]
+    with tempfile.TemporaryDirectory() as folder:
+        began = time.perf_counter()
+        shapes = open_shapes(data)
+        names = [name for split in shapes.names.values() for name in split]
+        meshes = [shapes.load(name).mesh for name in names]
+        every_task = (make(mesh) for mesh in meshes for make in makers.values())
+        run_tasks(every_task, Cache(folder), None, "Bodies")
+        everything = time.perf_counter() - began
+    return [*rows, {"what": "everything", "meshes": len(names), "seconds": everything}]

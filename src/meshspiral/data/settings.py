@@ -1,0 +1,54 @@
+"""The settings that every data set has: the config group `data`."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any, Literal
+
+from pydantic import BaseModel, BeforeValidator, Field
+
+
+def _as_text(value: Any) -> Any:
+    number = isinstance(value, int | float) and not isinstance(value, bool)
+    return str(value) if number else value
+
+
+# a path or name such as 2024, which YAML reads as a number
+Text = Annotated[str, BeforeValidator(_as_text)]
+
+
+class ShotSettings(BaseModel, extra="forbid", strict=True, frozen=True):
+    """SHOT descriptors."""
+
+    radius: float = Field(
+        gt=0, description="radius of SHOT's support over the square root of the surface area"
+    )
+    bins: int = Field(ge=1, description="bins of the cosine; 16 give 544 channels")
+
+
+class RemeshSettings(BaseModel, extra="forbid", strict=True, frozen=True):
+    """Another tessellation of every shape."""
+
+    policy: Literal["isotropic", "adaptive", "refined", "simplified", "marching", "mixed"] = Field(
+        description="kind of tessellation; mixed draws one for every shape"
+    )
+    vertices: int | None = Field(
+        ge=12, description="vertices of a remeshed shape; null: 5000 for a template of 6890"
+    )
+    copies: int = Field(ge=1, description="tessellations of each training shape")
+
+
+class DataSettings(BaseModel, extra="forbid", strict=True, frozen=True):
+    """What every data set has; a data set's own settings are fields of a subclass."""
+
+    name: str
+    remesh: RemeshSettings | None = Field(description="remesh every shape; null: as it is")
+    shot: ShotSettings
+    shuffle_vertices: bool = Field(description="renumber the vertices of every mesh at random")
+    cache_dir: Text = Field(description="folder of cached results")
+    workers: int | None = Field(
+        ge=1, description="processes that compute descriptors and tables; null: one per core"
+    )
+
+    def own(self) -> dict[str, Any]:
+        """The settings of this data set alone: the arguments of its class."""
+        return self.model_dump(exclude=set(DataSettings.model_fields))

@@ -1,0 +1,199 @@
+"""Testing a finished run again, on its own data set or another one with the same template."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from omegaconf import OmegaConf
+from tqdm import tqdm
+
+from meshspiral.data.datamodule import CorrespondenceData
+from meshspiral.data.files import write_file
+from meshspiral.data.settings import DataSettings
+from meshspiral.data.shapes import DataError
+from meshspiral.data.sources import open_data
+from meshspiral.evaluation.metrics import THRESHOLDS
+from meshspiral.evaluation.outcome import (
+    Outcome,
+    Result,
+    Rotations,
+    evenly,
+    result_of,
+    rotations,
+)
+from meshspiral.evaluation.run_folder import RunError
+from meshspiral.experiment.schema import ConfigError, TrainConfig, read_stored_config
+from meshspiral.geometry.digest import digest
+from meshspiral.geometry.mesh import Mesh
+from meshspiral.neighbourhoods import Neighbourhood
+from meshspiral.neighbourhoods.base import Batch
+from meshspiral.nn.loss import Prediction
+from meshspiral.viz.plots import all_curves_figure, encoded
+
+KINDS = ("png", "pdf", "svg")  # of a plot
+PLOTS = (
+    "errors.png",
+    "correspondence.png",
+    *(f"{plot}.{kind}" for plot in ("curve", "rotations") for kind in KINDS),
+)
+
+Predict = Callable[[Batch, str], Prediction]  # of a batch, for a purpose; see `Predictor`
+
+
+def config_on_data(trained: TrainConfig, requested: dict[str, Any]) -> TrainConfig:
+    """The config of a run with other data settings.
+
+    Args:
+        trained: The config of the run.
+        requested: Data settings that replace those of the run. If they name a data set, only the
+            run's `shot`, `shuffle_vertices`, `cache_dir` and `workers` remain. `root`, `cache_dir`
+            and `workers` of None count as not requested.
+
+    Raises:
+        ConfigError: A setting cannot be used.
+    """
+    unset = {key for key in ("root", "cache_dir", "workers") if requested.get(key) is None}
+    given = {key: value for key, value in requested.items() if key not in unset}
+    data = trained.data.model_dump()
+    if "name" in given:
+        shared = DataSettings.model_fields.keys() - {"name", "remesh"}
+        data = {key: data[key] for key in shared} | {"remesh": None}
+    merged = OmegaConf.to_container(OmegaConf.merge(data, given))
+    return read_stored_config(trained.model_dump() | {"data": merged}, "this evaluation")
+
+
+def check_rotations(count: int, config: TrainConfig) -> None:
+    """Raise ConfigError if repetitions are requested of a network without random neighbourhoods."""
+    neighbourhood = Neighbourhood.of(config.neighbourhood)
+    if count and not neighbourhood.random:
+        raise ConfigError(
+            f"rotations must be 0 for {config.model.name}, whose {neighbourhood.noun} are not "
+            f"random, got {count}"
+        )
+
+
+def open_test_data(
+    config: TrainConfig, template: Mesh, requested: dict[str, Any]
+) -> CorrespondenceData:
+    """The data set of a config, with its test shapes prepared.
+
+    Args:
+        config: From `config_on_data`.
+        template: The template that the run was trained on.
+        requested: The data settings that the user gave.
+
+    Raises:
+        RunError: The data set has another template.
+        DataError, MeshError: The data set cannot be used.
+    """
+    try:
+        data = open_data(config)
+    except DataError as error:
+        if "name" in requested:
+            raise
+        raise DataError(f"{error}; if the data set has moved, add data.root=") from error
+    theirs = data.shapes.template
+    if not (
+        np.array_equal(template.vertices, theirs.vertices)
+        and np.array_equal(template.faces, theirs.faces)
+    ):
+        raise RunError(
+            f"data {config.data.name} must have the template of the run, which has "
+            f"{len(template.vertices)} vertices; got another template, of {data.num_classes}"
+        )
+    data.prepare(["test"])
+    return data
+
+
+def choose_shapes(shapes: int | list[str], names: list[str]) -> list[str]:
+    """The test shapes to draw.
+
+    Args:
+        shapes: How many, spread evenly over the test set; or their names.
+        names: Names of all test shapes.
+
+    Raises:
+        ConfigError: There is no test shape of that name.
+    """
+    if isinstance(shapes, int):
+        return evenly(names, shapes) if shapes else []
+    if unknown := [name for name in shapes if name not in names]:
+        known = ", ".join(names)
+        raise ConfigError(f"shapes must be among the test shapes ({known}), got {unknown[0]}")
+    return shapes
+
+
+def evaluate(predict: Predict, data: CorrespondenceData) -> Outcome:
+    """Predict all test shapes as `train` does."""
+    names, items = data.shapes.names["test"], data.datasets["test"].items
+    progress = tqdm(range(len(items)), desc="Test", unit="mesh", leave=False, delay=1.0)
+    results = {i: predict_mesh(predict, data, i, "evaluation") for i in progress}
+    return Outcome.of(names, items, results, data.reference.diameter)
+
+
+def evaluate_rotations(predict: Predict, data: CorrespondenceData, count: int) -> Rotations:
+    """Predict all test shapes `count` times, each time with other random neighbourhoods."""
+    items = data.datasets["test"].items
+    progress = tqdm(range(count), desc="Rotations", unit="run")
+    runs = (
+        [predict_mesh(predict, data, i, f"rotation {r}") for i in range(len(items))]
+        for r in progress
+    )
+    return rotations(runs, [item["labels"].numpy() for item in items])
+
+
+def predict_mesh(predict: Predict, data: CorrespondenceData, i: int, purpose: str) -> Result:
+    """Prediction and errors of test mesh i; random neighbourhoods depend on the purpose."""
+    batch = data.datasets["test"][i]
+    classes = predict(batch, purpose).classes.cpu().numpy()
+    return result_of(classes, batch, data.reference)
+
+
+def create_folder(
+    run: Path, config: TrainConfig, trained: TrainConfig, requested: dict[str, Any]
+) -> Path:
+    """Create the folder of an evaluation, or remove the plots of an earlier one.
+
+    Args:
+        run: The run folder.
+        config: From `config_on_data`.
+        trained: The config of the run.
+        requested: The data settings that the user gave.
+
+    Returns:
+        <run>/evaluation/<name of the data set>; with a hash of its settings if another data set
+        than the run's own was requested.
+    """
+    data, own = (c.data.model_dump(exclude={"cache_dir", "workers"}) for c in (config, trained))
+    name = config.data.name
+    if "name" in requested and data != own:
+        name += f"-{digest(json.dumps(data, sort_keys=True))[:8]}"
+    folder = run / "evaluation" / name
+    folder.mkdir(parents=True, exist_ok=True)
+    for plot in PLOTS:
+        (folder / plot).unlink(missing_ok=True)
+    return folder
+
+
+def write_rotations(folder: Path, found: Rotations) -> None:
+    """Write the plot of all repetitions, rotations.<kind>."""
+    figure = all_curves_figure(THRESHOLDS, found.curves)
+    for kind in KINDS:
+        write_file(folder / f"rotations.{kind}", encoded(figure, kind))
+
+
+def rotation_lines(found: Rotations) -> list[str]:
+    """The metrics of all repetitions, for the log."""
+    exact, error = 100 * found.exact_match, found.geodesic_error
+    return [
+        f"{len(exact)} repetitions, each with other random neighbourhoods",
+        f"  exact match          {exact.mean():7.2f} % (standard deviation {exact.std():.2f}, "
+        f"{exact.min():.2f} to {exact.max():.2f})",
+        f"  mean geodesic error  {error.mean():9.4f} (standard deviation {error.std():.4f}, "
+        f"{error.min():.4f} to {error.max():.4f})",
+        f"  same prediction in all repetitions: {100 * found.unchanged:.2f} % of the vertices",
+    ]

@@ -1,0 +1,30 @@
+"""Composing a config without a command line."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from hydra import compose, initialize_config_dir
+from hydra.core.global_hydra import GlobalHydra
+
+from meshspiral.experiment.schema import TrainConfig, read_config
+
+PACKAGE = Path(__file__).parents[1]
+# in a clone conf/ is at its root; an installed package contains a copy
+CONF = str(next(p for p in (PACKAGE.parents[1] / "conf", PACKAGE / "conf") if p.is_dir()))
+
+
+def compose_train(overrides: list[str]) -> TrainConfig:
+    """The config that `train` composes from key=value words.
+
+    Raises:
+        ConfigError: A setting cannot be used.
+        HydraException: A word cannot be parsed, or names no option.
+    """
+    before = GlobalHydra.instance().hydra  # of the command that calls this
+    GlobalHydra.instance().clear()
+    try:
+        with initialize_config_dir(CONF, version_base="1.3"):
+            return read_config(TrainConfig, compose("train", overrides))
+    finally:
+        GlobalHydra.instance().hydra = before

@@ -1,0 +1,103 @@
+"""The text of --help, from the settings' descriptions and the files in conf/."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from omegaconf import OmegaConf
+from pydantic import BaseModel
+
+from meshspiral.data.settings import DataSettings, RemeshSettings, ShotSettings
+from meshspiral.data.shapes import ShapeSet
+from meshspiral.experiment.schema import (
+    BenchmarkConfig,
+    EvaluateConfig,
+    MatchConfig,
+    MeshesConfig,
+    OptimSettings,
+    ReportConfig,
+    TrainConfig,
+    TrainerSettings,
+)
+from meshspiral.neighbourhoods import Neighbourhood
+from meshspiral.nn.networks import Network
+
+COMMANDS = {
+    "train": TrainConfig,
+    "evaluate": EvaluateConfig,
+    "match": MatchConfig,
+    "meshes": MeshesConfig,
+    "report": ReportConfig,
+    "benchmark": BenchmarkConfig,
+}
+HIDDEN_GROUPS = ("cli", "hydra")
+
+
+def settings_help(command: str, conf: Path) -> str:
+    """What --help prints for a command.
+
+    Args:
+        command: Name of the command and of its file in conf/.
+        conf: The folder conf/.
+    """
+    intro = [
+        line.removeprefix("#").strip()
+        for line in (conf / f"{command}.yaml").read_text().splitlines()
+        if line.startswith("#")
+    ]
+    about = [line for line in intro if not line.startswith("python -m")]
+    examples = [f"  {line}" for line in intro if line.startswith("python -m")]
+    lines = [*about, "", "Examples:", *examples]
+    if groups := _groups(command, conf):
+        lines += ["", "Groups (choose with group=option):", *groups]
+    lines += ["", "Settings (change with key=value):", *_settings(COMMANDS[command])]
+    if command == "train":
+        parts: dict[str, type[BaseModel]] = {
+            "optim.": OptimSettings,
+            "trainer.": TrainerSettings,
+            "data.": DataSettings,
+            "data.shot.": ShotSettings,
+            "data.remesh.": RemeshSettings,
+        }
+        for prefix, schema in parts.items():
+            lines += _settings(schema, prefix)
+        for group, base in (("model", Network), ("neighbourhood", Neighbourhood)):
+            lines += ["", f"Settings of all options of {group}:"]
+            lines += _settings(base.Settings, f"{group}.")
+            lines += _own_settings(group, base.registered, base.Settings)
+        lines += ["", "Settings of single options of data:"]
+        lines += _own_settings("data", ShapeSet.registered, DataSettings)
+    lines += ["", "All settings with their values: add --cfg job", ""]
+    return "\n".join(lines).replace("$", "$$")  # Hydra substitutes $NAME
+
+
+def _groups(command: str, conf: Path) -> list[str]:
+    defaults = OmegaConf.to_container(OmegaConf.load(conf / f"{command}.yaml"))["defaults"]
+    used = {key for entry in defaults if isinstance(entry, dict) for key in entry}
+    used |= {"neighbourhood"} if "model" in used else set()
+    used |= {"data/remesh"} if "data" in used else set()
+    lines = []
+    for group in sorted(used - set(HIDDEN_GROUPS)):
+        options = sorted(path.stem for path in (conf / group).glob("*.yaml"))
+        lines.append(f"  {group:<14} {', '.join(options)}")
+    return lines
+
+
+def _settings(schema: type[BaseModel], prefix: str = "", known: type | None = None) -> list[str]:
+    """A line for each setting that is not a group of settings."""
+    fields = schema.model_fields.items()
+    skip = set(known.model_fields) if known else set()
+    return [
+        f"  {prefix + name:<24} {field.description}"
+        for name, field in fields
+        if field.description and name not in skip
+    ]
+
+
+def _own_settings(group: str, registered: dict[str, type], common: type[BaseModel]) -> list[str]:
+    """The settings that single options add: one line each, with the options that have it."""
+    owners: dict[str, list[str]] = {}
+    for name, cls in registered.items():
+        for line in _settings(cls.Settings, f"{group}.", common):
+            owners.setdefault(line, []).append(name)
+    return [f"{line} ({', '.join(names)})" for line, names in owners.items()]

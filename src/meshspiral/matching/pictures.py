@@ -1,0 +1,74 @@
+"""Renders of a match: correspondences and confidences."""
+
+from __future__ import annotations
+
+import logging
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from meshspiral.data.files import write_file
+from meshspiral.geometry.mesh import Mesh
+from meshspiral.matching.job import FileMatch, LabelledScan
+from meshspiral.matching.transfer import transfer
+from meshspiral.viz.colors import GREY, confidence_colors, point_colors, template_colors
+from meshspiral.viz.plots import encoded, picture_figure
+from meshspiral.viz.render import RenderError, Row, render
+
+log = logging.getLogger(__name__)
+
+
+def draw_pictures(folder: Path, match: FileMatch, template: Mesh, up: str) -> None:
+    """Render correspondence.png and confidence.png.
+
+    Both show the target, or the template without one, and beside it the source, in the template's
+    pose. Without an OpenGL library, a warning says that they are skipped.
+
+    Args:
+        folder: Where to write them.
+        match: What to show.
+        template: The template of the labels.
+        up: The template's axis that points up, "y" or "z".
+    """
+    source, target = match.source, match.target
+    if target:
+        target_colors = point_colors(template, target.labels.points)
+        source_colors = transfer(target_colors, match.map, GREY)
+        colors = [target.on_mesh(target_colors), source.on_mesh(source_colors)]
+        meshes = [align_to_template(target, template), align_to_template(source, template)]
+        confidences = [target.on_mesh(target.labels.confidence)]
+    else:
+        source_colors = point_colors(template, source.labels.points)
+        colors = [template_colors(template), source.on_mesh(source_colors)]
+        meshes = [template, align_to_template(source, template)]
+        confidences = [np.ones(len(template.vertices))]
+    confidences.append(source.on_mesh(source.labels.confidence))
+    rows = [Row(meshes, colors), Row(meshes, [confidence_colors(c) for c in confidences])]
+    try:
+        correspondence, confidence = render(rows, up)
+    except RenderError as error:
+        log.warning("skipping renders: %s", error)
+        return
+    captions = ["target" if target else "template", "source"]
+    figures = {
+        "correspondence": picture_figure(*correspondence, captions),
+        "confidence": picture_figure(*confidence, captions, bar="confidence"),
+    }
+    for name, figure in figures.items():
+        write_file(folder / f"{name}.png", encoded(figure, "png"))
+
+
+def align_to_template(labelled: LabelledScan, template: Mesh) -> Mesh:
+    """The mesh of a scan, scaled, translated and rotated to fit its labels on the template.
+
+    The mesh gets the template's area; the rotation is the best in the sense of least squares,
+    weighted by confidence (Kabsch 1976).
+    """
+    mesh, points = labelled.scan.mesh, labelled.on_mesh(labelled.labels.points)
+    weights = labelled.on_mesh(labelled.labels.confidence) + 1e-6  # never all zero
+    vertices = mesh.vertices * np.sqrt(template.area / mesh.area)
+    vertices -= np.average(vertices, axis=0, weights=weights)
+    centred_points = points - np.average(points, axis=0, weights=weights)
+    rotation, _ = Rotation.align_vectors(centred_points, vertices, weights)
+    return Mesh(rotation.apply(vertices), mesh.faces, mesh.name)

@@ -1,0 +1,190 @@
+"""The files of a match: each is written whole or not at all, match.npz last."""
+
+from __future__ import annotations
+
+import io
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import trimesh
+
+from meshspiral.data.files import write_arrays, write_file
+from meshspiral.data.scans import Scan
+from meshspiral.data.shapes import DataError
+from meshspiral.geometry.mesh import MeshError
+from meshspiral.matching.job import FileMatch, MatchJob
+from meshspiral.matching.pictures import draw_pictures
+from meshspiral.matching.transfer import transfer
+from meshspiral.viz.colors import GREY, point_colors
+
+RESULT = "match.npz"
+TARGET_FILES = ("target.npz", "target.ply")
+SOURCE_FILES = (
+    RESULT,
+    "map.txt",
+    "template.txt",
+    "remarks.txt",
+    "source.ply",
+    "transferred.npy",
+    "transferred.ply",
+    "transferred.obj",
+    "correspondence.png",
+    "confidence.png",
+)
+
+
+def write_match(job: MatchJob, match: FileMatch, folder: Path) -> None:
+    """Write the files of a match, and delete those of an earlier one.
+
+    Args:
+        job: The job of the match.
+        match: What to write.
+        folder: Created if it is missing.
+
+    Raises:
+        DataError: A file would overwrite an input, or the folder has the match of another mesh.
+        OSError: A file cannot be written.
+    """
+    check_inputs(folder, match.path, *job.inputs)
+    _check_owner(folder, match.path)
+    folder.mkdir(parents=True, exist_ok=True)
+    delete_files(folder, SOURCE_FILES if match.target else SOURCE_FILES + TARGET_FILES)
+    template, (scan, labels) = job.matcher.template, match.source
+    arrays = labels._asdict()
+    if match.target:
+        arrays["map"] = match.map
+        write_integers(folder / "map.txt", match.map)
+        target_colors = point_colors(template, match.target.labels.points)
+        colors = transfer(target_colors, match.map, GREY)
+    else:
+        colors = point_colors(template, labels.points)
+    write_integers(folder / "template.txt", labels.template)
+    write_file(folder / "remarks.txt", "\n".join(remark_lines(match)) + "\n")
+    write_colored_mesh(folder / "source.ply", scan, colors)
+    if job.transfer_values is not None:
+        values = transfer(job.transfer_values, match.map, 0)
+        write_transferred(folder, scan, values, job.config.transfer)
+    if job.render:
+        draw_pictures(folder, match, template, job.matcher.up)
+    origin = {"key": np.array(job.key(match.path)), "source": np.array(_absolute(match.path))}
+    write_arrays(folder / RESULT, **origin, **arrays)  # the last file: now the match is complete
+
+
+def write_target(job: MatchJob, folder: Path) -> None:
+    """Write target.npz and target.ply, which all sources share.
+
+    Raises:
+        DataError: A file would overwrite an input.
+        OSError: A file cannot be written.
+    """
+    check_inputs(folder, *job.inputs)
+    folder.mkdir(parents=True, exist_ok=True)
+    scan, labels = job.target
+    write_arrays(folder / "target.npz", **labels._asdict())
+    colors = point_colors(job.matcher.template, labels.points)
+    write_colored_mesh(folder / "target.ply", scan, colors)
+
+
+def is_finished(job: MatchJob, path: str, folder: Path) -> bool:
+    """Whether a folder has the complete match of this source file, with the job's settings."""
+    result = _read_result(folder)
+    try:
+        return result is not None and result == (job.key(path), _absolute(path))
+    except MeshError:  # unreadable: reported when it is matched
+        return False
+
+
+def check_inputs(folder: Path, *inputs: str) -> None:
+    """Raise DataError if a file to be written to the folder would overwrite an input."""
+    outputs = {(folder / name).resolve() for name in SOURCE_FILES + TARGET_FILES}
+    for path in inputs:
+        if Path(path).resolve() in outputs:
+            raise DataError(f"{path} would be overwritten; choose another folder with output=")
+
+
+def _check_owner(folder: Path, path: str) -> None:
+    """Raise DataError if the folder has the match of another mesh."""
+    result = _read_result(folder)
+    if result is not None and result[1] != _absolute(path):
+        raise DataError(
+            f"{folder} contains the match of {result[1]}; choose another folder with output="
+        )
+
+
+def _read_result(folder: Path) -> tuple[str, str] | None:
+    """The key and the source of the match in a folder; None without a complete one."""
+    try:
+        with np.load(folder / RESULT, allow_pickle=False) as file:
+            return str(file["key"]), str(file["source"])
+    except Exception:  # whatever NumPy raises for a missing or damaged file
+        return None
+
+
+def delete_files(folder: Path, names: tuple[str, ...]) -> None:
+    """Delete files that may exist."""
+    for name in names:
+        (folder / name).unlink(missing_ok=True)
+
+
+def remark_lines(match: FileMatch) -> list[str]:
+    """Confidence and remarks of source and target, as lines of text."""
+    lines = []
+    for role, labelled in (("source", match.source), ("target", match.target)):
+        if labelled is not None:
+            scan, labels = labelled
+            confidence = labels.confidence[labels.template >= 0]
+            lines.append(
+                f"{role}: {scan.mesh.name}, {len(scan.vertices):,} vertices; median confidence "
+                f"{np.median(confidence):.2f}, below 0.1 at {100 * (confidence < 0.1).mean():.1f} %"
+            )
+            lines += [f"  {remark}" for remark in scan.remarks]
+    return lines
+
+
+def write_integers(path: Path, integers: np.ndarray) -> None:
+    """Write a text file with one integer per line."""
+    write_file(path, "\n".join(map(str, integers.tolist())) + "\n")
+
+
+def write_colored_mesh(path: Path, scan: Scan, colors: np.ndarray) -> None:
+    """Write the user's mesh as a PLY file with vertex colours.
+
+    Args:
+        path: The file.
+        scan: The mesh.
+        colors: float [V, 3] in 0..1.
+    """
+    mesh = _user_mesh(scan, vertex_colors=np.round(255 * colors).astype(np.uint8))
+    write_file(path, mesh.export(file_type="ply"))
+
+
+def write_transferred(folder: Path, scan: Scan, values: np.ndarray, kind: str) -> None:
+    """Write transferred.npy; for colours also transferred.ply, for uv also transferred.obj.
+
+    Args:
+        folder: Where to write them.
+        scan: The source.
+        values: Values of its vertices, [V, ...].
+        kind: What they are: "color", "uv", or anything else.
+    """
+    buffer = io.BytesIO()
+    np.save(buffer, values)
+    write_file(folder / "transferred.npy", buffer.getvalue())
+    if kind == "color":
+        mesh = _user_mesh(scan, vertex_colors=values)
+        write_file(folder / "transferred.ply", mesh.export(file_type="ply"))
+    if kind == "uv":
+        mesh = _user_mesh(scan, visual=trimesh.visual.TextureVisuals(uv=values))
+        text = trimesh.exchange.obj.export_obj(mesh, include_normals=False, write_texture=False)
+        write_file(folder / "transferred.obj", text)
+
+
+def _user_mesh(scan: Scan, **visual: Any) -> trimesh.Trimesh:
+    """The user's own vertices, and those of the user's faces that name existing vertices."""
+    faces = scan.faces[((scan.faces >= 0) & (scan.faces < len(scan.vertices))).all(axis=1)]
+    return trimesh.Trimesh(scan.vertices, faces, process=False, **visual)
+
+
+def _absolute(path: str) -> str:
+    return str(Path(path).resolve())

@@ -1,0 +1,56 @@
+"""FCS-NET (Lim et al. 2018): a fully connected layer over each spiral."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+from torch import nn
+
+from meshspiral.nn.layers import SpiralLinear
+from meshspiral.nn.networks.spiral_net import SpiralNet
+
+
+class FCSNet(SpiralNet, name="fcs"):
+    """FCS-NET: a fully connected layer over each spiral of fixed length.
+
+    Args:
+        in_features: Number of channels of the descriptor.
+        num_classes: Number of vertices of the template.
+        seq_len: Number of vertices of every spiral.
+        channels: Number of output channels of each of the three layers.
+        metric: Whether layers read metric information.
+        metric_layers: "all" layers read it, or the "first" alone.
+        dropout: Probability of dropout after FC16 and FC256.
+        feature_scale: Constant factor of the descriptors.
+    """
+
+    title = "FCS-NET"
+
+    def __init__(
+        self,
+        in_features: int,
+        num_classes: int,
+        seq_len: int,
+        channels: Sequence[int] = (100, 150, 200),
+        metric: bool = False,
+        metric_layers: str = "all",
+        dropout: float = 0.3,
+        feature_scale: float = 1.0,
+    ):
+        self.seq_len = seq_len
+        super().__init__(
+            in_features, num_classes, channels, metric, metric_layers, dropout, feature_scale
+        )
+
+    @classmethod
+    def check(cls, neighbourhood: Any) -> None:
+        if neighbourhood.length is None:
+            raise ValueError(f"{cls.name} needs sequences of one length, got {neighbourhood.title}")
+
+    @classmethod
+    def options(cls, neighbourhood: Any) -> dict[str, Any]:
+        return {"seq_len": neighbourhood.length}
+
+    def spiral_layer(self, in_features: int, out_features: int, metric: bool) -> nn.Module:
+        return SpiralLinear(in_features, out_features, self.seq_len, metric)

@@ -1,0 +1,43 @@
+"""LSTM-NET (Lim et al. 2018): an LSTM along each spiral."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from torch import nn
+
+from meshspiral.nn.layers import SpiralLSTM
+from meshspiral.nn.networks.spiral_net import SpiralNet
+
+
+class LSTMNet(SpiralNet, name="lstm"):
+    """LSTM-NET: an LSTM along each spiral; lengths may be any, and differ.
+
+    Args:
+        in_features: Number of channels of the descriptor.
+        num_classes: Number of vertices of the template.
+        channels: Number of output channels of each of the three layers.
+        metric: Whether layers read metric information.
+        metric_layers: "all" layers read it, or the "first" alone.
+        dropout: Probability of dropout after FC16 and FC256.
+        feature_scale: Constant factor of the descriptors.
+    """
+
+    title = "LSTM-NET"
+
+    def __init__(
+        self,
+        in_features: int,
+        num_classes: int,
+        channels: Sequence[int] = (150, 200, 250),
+        metric: bool = False,
+        metric_layers: str = "all",
+        dropout: float = 0.3,
+        feature_scale: float = 1.0,
+    ):
+        super().__init__(
+            in_features, num_classes, channels, metric, metric_layers, dropout, feature_scale
+        )
+
+    def spiral_layer(self, in_features: int, out_features: int, metric: bool) -> nn.Module:
+        return SpiralLSTM(in_features, out_features, metric)

@@ -1,0 +1,88 @@
+"""The base class of networks whose layers read spirals."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any, Literal
+
+from pydantic import Field
+from torch import Tensor, nn
+
+from meshspiral.nn.layers import metric_features
+from meshspiral.nn.networks.base import Network
+
+METRIC_LAYERS = ("all", "first")
+
+
+class SpiralNet(Network):
+    """A network with three layers on sequences of vertices. A subclass implements `spiral_layer`.
+
+    Args:
+        in_features: Number of channels of the descriptor.
+        num_classes: Number of vertices of the template.
+        channels: Number of output channels of each of the three layers.
+        metric: Whether layers read metric information, see `metric_features`.
+        metric_layers: "all" layers read it, or the "first" alone.
+        dropout: Probability of dropout after FC16 and FC256.
+        feature_scale: Constant factor of the descriptors.
+
+    Raises:
+        ValueError: `metric_layers` is neither "all" nor "first".
+    """
+
+    reads = "spirals"
+
+    class Settings(Network.Settings):
+        metric: bool = Field(description="read metric information: distance and angle")
+        metric_layers: Literal["all", "first"] = Field(
+            description="spiral layers that read metric information: all, or the first alone"
+        )
+
+    def __init__(
+        self,
+        in_features: int,
+        num_classes: int,
+        channels: Sequence[int],
+        metric: bool,
+        metric_layers: str,
+        dropout: float,
+        feature_scale: float,
+    ):
+        if metric_layers not in METRIC_LAYERS:
+            raise ValueError(f"metric_layers must be one of {METRIC_LAYERS}, got {metric_layers!r}")
+        self.metric, self.metric_layers = metric, metric_layers
+        super().__init__(in_features, num_classes, channels, dropout, feature_scale)
+
+    def layer(self, i: int, in_features: int, out_features: int) -> nn.Module:
+        takes_metric = self.metric and (i == 0 or self.metric_layers == "all")
+        return self.spiral_layer(in_features, out_features, takes_metric)
+
+    def spiral_layer(self, in_features: int, out_features: int, metric: bool) -> nn.Module:
+        """A layer that takes features [V, in_features], spirals [V, N] and metric information
+        [V, N, 2] or None, and returns [V, out_features]."""
+        raise NotImplementedError
+
+    def embed_batch(self, batch: Mapping[str, Any]) -> Tensor:
+        metric = None
+        if self.metric:
+            metric = metric_features(batch["vertices"], batch["spirals"], batch["unit"])
+        return self.embed(batch["features"], batch["spirals"], metric)
+
+    def embed(self, features: Tensor, spirals: Tensor, metric: Tensor | None = None) -> Tensor:
+        """Everything but the last layer.
+
+        Args:
+            features: float [V, in_features].
+            spirals: int64 [V, N], -1 where a spiral has ended.
+            metric: float [V, N, 2], see `metric_features`.
+
+        Returns:
+            float [V, 256].
+
+        Raises:
+            ValueError: `metric` is missing, or given to a network without metric information.
+        """
+        if (metric is not None) != self.metric:
+            negation = "" if self.metric else "out"
+            raise ValueError(f"this network was made with{negation} metric information")
+        return super().embed(features, spirals, metric)
