@@ -1,9 +1,9 @@
-"""Ten thousand damaged meshes through the whole chain, outside the tests:
+"""A fuzz test of matching with many damaged meshes, too long for the test suite:
 
     python -m tests.campaign 10000
 
-Every outcome must be labels or one line. Prints how many of which, what the slowest took, and every
-outcome that is neither, with the number that makes it again.
+Every mesh must get labels or be refused in one line. Prints the number of each outcome, the slowest
+mesh, and every violation with the mesh's number, which reproduces it.
 """
 
 from __future__ import annotations
@@ -15,55 +15,68 @@ import traceback
 import warnings
 from collections import Counter
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import torch
 from joblib import Parallel, delayed
 from tqdm import tqdm
 
+from meshspiral import Matcher, open_scan
 from meshspiral.data.datasets.bodies import Bodies
-from meshspiral.data.scans import open_scan
 from meshspiral.geometry.mesh import MeshError
 from meshspiral.geometry.resample import resample
-from meshspiral.matching.matcher import Matcher
 from tests.damage import damaged_file
 
-KINDS = {"plain": (False, False), "resampled": (True, False), "smooth": (False, True)}
-BLOCK = 50
+OPTIONS = [
+    {"resampled": False},
+    {"resampled": True},
+    {"resampled": False, "smooth": True},
+]
+BLOCK = 50  # meshes per job
 
 
-def block(first: int, last: int) -> list[tuple[int, str, float, str]]:
-    """For each number its outcome, the seconds it took, and what is wrong with it."""
+class Outcome(NamedTuple):
+    """What happened to a mesh; `violation` describes what is wrong with that, or is empty."""
+
+    kind: str
+    violation: str
+
+
+def check_block(first: int, last: int) -> list[tuple[int, float, Outcome]]:
+    """Label the meshes first..last-1; returns the number, seconds and outcome of each."""
     torch.set_num_threads(1)
     np.seterr(all="ignore")
     warnings.simplefilter("ignore")
     body = resample(Bodies().template, 400).mesh
-    matchers = {kind: Matcher.load(resampled=r, smooth=s) for kind, (r, s) in KINDS.items()}
+    matchers = [Matcher.load(**options) for options in OPTIONS]
     rows = []
     with tempfile.TemporaryDirectory() as folder:
         for number in range(first, last):
             suffix, data = damaged_file(body, number)
             path = Path(folder, f"mesh{suffix}")
             path.write_bytes(data)
-            kind = list(KINDS)[number % 3]
             began = time.perf_counter()
-            outcome, wrong = one(path, matchers[kind], repair=number % 2 == 0)
-            rows.append((number, outcome, time.perf_counter() - began, wrong))
+            outcome = check_file(path, matchers[number % 3], repair=number % 2 == 0)
+            rows.append((number, time.perf_counter() - began, outcome))
     return rows
 
 
-def one(path: Path, matcher: Matcher, repair: bool) -> tuple[str, str]:
+def check_file(path: Path, matcher: Matcher, repair: bool) -> Outcome:
+    """Label one mesh file."""
     try:
         found = open_scan(path, repair)
         labels = matcher.label(found)
     except MeshError as error:
-        line = str(error)
-        return "refused in one line", "" if "\n" not in line and len(line) < 600 else line
+        message = str(error)
+        one_line = "\n" not in message and len(message) < 600
+        return Outcome("refused in one line", "" if one_line else message)
     except Exception:
-        return "error", traceback.format_exc()
-    known = found.place >= 0
-    whole = np.array_equal(labels.template >= 0, known) and np.isfinite(labels.points[known]).all()
-    return "labelled", "" if whole else "labels that are not whole"
+        return Outcome("error", traceback.format_exc())
+    known = found.vertex_of >= 0
+    complete = np.array_equal(labels.template >= 0, known)
+    complete = complete and np.isfinite(labels.points[known]).all()
+    return Outcome("labelled", "" if complete else "labels are missing")
 
 
 def main() -> None:
@@ -73,14 +86,14 @@ def main() -> None:
     slowest = (0.0, -1)
     began = time.perf_counter()
     pool = Parallel(n_jobs=-1, return_as="generator_unordered")
-    for rows in tqdm(pool(delayed(block)(*each) for each in blocks), total=len(blocks)):
-        for number, outcome, seconds, wrong in rows:
-            outcomes["wrong" if wrong else outcome] += 1
+    for rows in tqdm(pool(delayed(check_block)(*each) for each in blocks), total=len(blocks)):
+        for number, seconds, outcome in rows:
+            outcomes["violation" if outcome.violation else outcome.kind] += 1
             slowest = max(slowest, (seconds, number))
-            if wrong:
-                tqdm.write(f"{number}: {wrong}")
-    for outcome, times in outcomes.most_common():
-        print(f"{times:8,} {outcome}")
+            if outcome.violation:
+                tqdm.write(f"{number}: {outcome.violation}")
+    for kind, meshes in outcomes.most_common():
+        print(f"{meshes:8,} {kind}")
     print(f"slowest: {slowest[0]:.1f} s (number {slowest[1]})")
     print(f"{count:,} meshes in {time.perf_counter() - began:.0f} s")
 

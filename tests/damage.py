@@ -1,4 +1,4 @@
-"""Meshes damaged at random, as arrays and as bytes of files."""
+"""Random damage to meshes, as arrays and as bytes of files; the same for the same seed."""
 
 from __future__ import annotations
 
@@ -86,7 +86,7 @@ def _twice(rng, v, f):
 
 
 def _pinched(rng, v, f):
-    """Two vertices become one: a bow tie, or edges with four faces."""
+    """Merge two vertices: into a bow tie, or with edges of four faces."""
     one, two = rng.integers(len(v), size=2)
     return v, np.where(f == one, two, f)
 
@@ -113,7 +113,7 @@ DAMAGES = [
 
 
 def damaged(mesh: Mesh, seed: int) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices and faces after one to four kinds of damage."""
+    """Vertices [V, 3] and faces [F, 3] of a mesh after one to four kinds of damage."""
     rng = np.random.default_rng(seed)
     vertices, faces = mesh.vertices.copy(), mesh.faces.astype(np.int64)
     with np.errstate(all="ignore"):
@@ -125,18 +125,18 @@ def damaged(mesh: Mesh, seed: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def damaged_file(mesh: Mesh, seed: int) -> tuple[str, bytes]:
-    """The suffix and the bytes of a file with a damaged mesh, or with damaged bytes."""
+    """The suffix and content of a mesh file in which the mesh, the bytes or both are damaged."""
     rng = np.random.default_rng(seed)
     suffix = SUFFIXES[rng.integers(len(SUFFIXES))]
     vertices, faces = damaged(mesh, seed) if rng.random() < 0.7 else (mesh.vertices, mesh.faces)
-    faces = np.clip(faces, 0, max(len(vertices) - 1, 0))  # else trimesh can't write it
+    faces = np.clip(faces, 0, max(len(vertices) - 1, 0))  # trimesh cannot write others
     options = {"encoding": "ascii"} if suffix == ".ply" and rng.random() < 0.5 else {}
     with np.errstate(all="ignore"):
         try:
             data = trimesh.Trimesh(vertices, faces, process=False).export(
                 file_type=suffix[1:], **options
             )
-        except Exception:  # trimesh can't write all of them
+        except Exception:  # some meshes cannot be written
             data = b""
     data = data.encode() if isinstance(data, str) else bytes(data)
     if rng.random() < 0.5 and data:
@@ -145,12 +145,12 @@ def damaged_file(mesh: Mesh, seed: int) -> tuple[str, bytes]:
             case 0:
                 data = data[: rng.integers(len(data))]
             case 1:
-                for place in rng.integers(len(data), size=rng.integers(1, 30)):
-                    data[place] = rng.integers(256)
+                for position in rng.integers(len(data), size=rng.integers(1, 30)):
+                    data[position] = rng.integers(256)
             case 2:
                 start = rng.integers(len(data))
                 del data[start : start + rng.integers(1, 200)]
             case 3:
-                for place in rng.integers(min(len(data), 400), size=3):
-                    data[place] = rng.integers(256)
+                for position in rng.integers(min(len(data), 400), size=3):  # the header
+                    data[position] = rng.integers(256)
     return suffix, bytes(data)

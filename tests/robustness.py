@@ -1,105 +1,125 @@
-"""What changes of a mesh do to the labels it gets, outside the tests:
+"""How robust labels are to changes of a mesh, measured outside the test suite:
 
     python -m tests.robustness 20 [run folder]
 
-On so many of the 20 test bodies, with the network that comes with the repository or another: exact
-match, and the mean error to the true point on the template, over the square root of its area.
+Labels that many of the 20 test bodies with the bundled network or that of a run. Prints for each
+change of the bodies, and for each option of the matcher, the share of exact matches, the mean error
+to the true point over the square root of the template's area, and the median seconds of a mesh.
 """
 
 from __future__ import annotations
 
 import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import trimesh
 from tqdm import tqdm
 
+from meshspiral import Matcher, Mesh, scan
 from meshspiral.data.cache import Cache
 from meshspiral.data.datasets.bodies import Bodies
 from meshspiral.data.reference import ReferenceDistances
 from meshspiral.data.remeshed import Remeshed
-from meshspiral.data.scans import scan
 from meshspiral.data.shapes import Shape
 from meshspiral.evaluation.metrics import geodesic_errors, point_errors
 from meshspiral.evaluation.outcome import evenly
-from meshspiral.matching.matcher import Matcher
 
-STORE = Cache("outputs/cache")
-HOLES = "a tenth of the faces gone"
+CACHE = Cache("outputs/cache")
+HOLES = "a tenth of the faces removed"
+TESSELLATIONS = [  # policy, number of vertices
+    ("isotropic", 750),
+    ("isotropic", 1500),
+    ("isotropic", 3000),
+    ("isotropic", 15000),
+    ("mixed", 1500),
+]
+OPTIONS = {
+    "default": {},
+    "smooth": {"smooth": True},
+    "never resampled": {"resampled": False},
+    "always resampled": {"resampled": True},
+}
 
 
-def changed(body: Shape, what: str, rng: np.random.Generator) -> Shape:
+def with_mesh(body: Shape, vertices: np.ndarray, faces: np.ndarray) -> Shape:
+    return Shape(Mesh(vertices, faces, body.mesh.name), body.labels, body.template_size)
+
+
+def rotate(body: Shape, rng: np.random.Generator) -> Shape:
+    rotation = trimesh.transformations.random_rotation_matrix(rng.random(3))[:3, :3]
+    return with_mesh(body, body.mesh.vertices @ rotation.T, body.mesh.faces)
+
+
+def scale_and_move(body: Shape, rng: np.random.Generator) -> Shape:
+    return with_mesh(body, 1000 * body.mesh.vertices + np.array([1e6, 0, 0]), body.mesh.faces)
+
+
+def renumber(body: Shape, rng: np.random.Generator) -> Shape:
+    return body.renumbered(rng.permutation(len(body.mesh.vertices)))
+
+
+def add_noise(body: Shape, rng: np.random.Generator) -> Shape:
+    vertices = body.mesh.vertices
+    return with_mesh(body, vertices + rng.normal(scale=0.002, size=vertices.shape), body.mesh.faces)
+
+
+def remove_faces(body: Shape, rng: np.random.Generator) -> Shape:
+    faces = body.mesh.faces
+    return with_mesh(body, body.mesh.vertices, faces[rng.random(len(faces)) >= 0.1])
+
+
+def cut_at_the_waist(body: Shape, rng: np.random.Generator) -> Shape:
     vertices, faces = body.mesh.vertices, body.mesh.faces
-    if what == "rotated":
-        turn = trimesh.transformations.random_rotation_matrix(rng.random(3))[:3, :3]
-        vertices = vertices @ turn.T
-    elif what == "times 1000, moved by 1 km":
-        vertices = 1000 * vertices + np.array([1e6, 0, 0])
-    elif what == "renumbered":
-        return body.renumbered(rng.permutation(len(vertices)))
-    elif what == "noise of 2 mm":
-        vertices = vertices + rng.normal(scale=0.002, size=vertices.shape)
-    elif what == HOLES:
-        faces = faces[rng.random(len(faces)) >= 0.1]
-    elif what == "cut off at the waist":
-        keep = vertices[:, 2] > np.median(vertices[:, 2])
-        faces = faces[keep[faces].all(axis=1)]
-    return Shape(type(body.mesh)(vertices, faces, body.mesh.name), body.labels, body.template_size)
+    keep = vertices[:, 2] > np.median(vertices[:, 2])
+    return with_mesh(body, vertices, faces[keep[faces].all(axis=1)])
+
+
+CHANGES: dict[str, Callable[[Shape, np.random.Generator], Shape]] = {
+    "unchanged": lambda body, rng: body,
+    "rotated": rotate,
+    "times 1000, moved by 1 km": scale_and_move,
+    "renumbered": renumber,
+    "noise of 2 mm": add_noise,
+    HOLES: remove_faces,
+    "cut off at the waist": cut_at_the_waist,
+}
 
 
 def main() -> None:
-    count, run = int(sys.argv[1]), (sys.argv[2] if len(sys.argv) > 2 else None)
+    count, run = int(sys.argv[1]), (Path(sys.argv[2]) if len(sys.argv) > 2 else None)
     bodies = Bodies(1500)
     names = evenly(bodies.names["test"], count)
-    reference = ReferenceDistances(bodies.template, STORE)
-    plain = [bodies.load(name) for name in names]
+    reference = ReferenceDistances(bodies.template, CACHE)
+    originals = [bodies.load(name) for name in names]
     rng = np.random.default_rng(0)
-    cases = {
-        what: [changed(body, what, rng) for body in plain]
-        for what in (
-            "as they are",
-            "rotated",
-            "times 1000, moved by 1 km",
-            "renumbered",
-            "noise of 2 mm",
-            HOLES,
-            "cut off at the waist",
-        )
-    }
-    for policy, vertices in [
-        ("isotropic", 750),
-        ("isotropic", 1500),
-        ("isotropic", 3000),
-        ("isotropic", 15000),
-        ("mixed", 1500),
-    ]:
-        made = Remeshed(bodies, STORE, None, policy, vertices)
-        made.prepare(names)
-        cases[f"{policy}, {vertices:,} vertices"] = [made.load(name) for name in names]
-    options = {
-        "default": {},
-        "smooth": {"smooth": True},
-        "never resampled": {"resampled": False},
-        "always resampled": {"resampled": True},
-    }
-    print(f"{'':36}" + "".join(f"{name:>26}" for name in options))
-    matchers = [Matcher.load(run and Path(run), **each) for each in options.values()]
-    cases["the same, repair=true"] = cases[HOLES]
-    for what, shapes in cases.items():
-        mend = "repair" in what
-        row = [measured(matcher, shapes, reference, mend) for matcher in matchers]
-        print(
-            f"{what:36}" + "".join(f"{100 * e:8.1f} % {m:7.4f} {s:6.2f} s" for e, m, s in row),
-            flush=True,
-        )
-    for what in ("as they are", "isotropic, 1,500 vertices", "mixed, 1,500 vertices"):
-        print(f"by confidence, {what}:\n{by_confidence(matchers[0], cases[what], reference)}")
+    cases = {title: [change(body, rng) for body in originals] for title, change in CHANGES.items()}
+    for policy, vertices in TESSELLATIONS:
+        remeshed = Remeshed(bodies, CACHE, None, policy, vertices)
+        remeshed.prepare(names)
+        cases[f"{policy}, {vertices:,} vertices"] = [remeshed.load(name) for name in names]
+    matchers = [Matcher.load(run, **options) for options in OPTIONS.values()]
+    print(f"{'':44}" + "".join(f"{name:>26}" for name in OPTIONS))
+    for title, shapes in cases.items():
+        print_row(title, [measure(matcher, shapes, reference) for matcher in matchers])
+    repaired = [measure(matcher, cases[HOLES], reference, repair=True) for matcher in matchers]
+    print_row(f"{HOLES}, repair=true", repaired)
+    for title in ("unchanged", "isotropic, 1,500 vertices", "mixed, 1,500 vertices"):
+        print(f"by confidence, {title}:")
+        print("\n".join(confidence_lines(matchers[0], cases[title], reference)))
 
 
-def by_confidence(matcher: Matcher, shapes: list[Shape], reference: ReferenceDistances) -> str:
-    """The share of vertices in each fifth of the confidences, and how far off they are."""
+def print_row(title: str, values: list[tuple[float, float, float]]) -> None:
+    columns = (f"{100 * e:8.1f} % {m:7.4f} {s:6.2f} s" for e, m, s in values)
+    print(f"{title:44}" + "".join(columns), flush=True)
+
+
+def confidence_lines(
+    matcher: Matcher, shapes: list[Shape], reference: ReferenceDistances
+) -> list[str]:
+    """For each fifth of the range of confidences: its share of the vertices, and their errors."""
     found = [matcher.label(scan(s.mesh.vertices, s.mesh.faces, s.mesh.name)) for s in shapes]
     confidence = np.concatenate([labels.confidence for labels in found])
     errors = np.concatenate(
@@ -110,30 +130,33 @@ def by_confidence(matcher: Matcher, shapes: list[Shape], reference: ReferenceDis
     )
     lines = []
     for low in (0.0, 0.2, 0.4, 0.6, 0.8):
-        among = (confidence >= low) & (confidence < low + 0.2 + (low == 0.8))
-        if among.any():
+        within = (confidence >= low) & (confidence < low + 0.2 + (low == 0.8))
+        if within.any():
             lines.append(
-                f"  {low:.1f} to {low + 0.2:.1f}: {100 * among.mean():5.1f} % of the "
-                f"vertices, {100 * (errors[among] == 0).mean():5.1f} % exact, "
-                f"{100 * (errors[among] < 0.05).mean():5.1f} % within 0.05"
+                f"  {low:.1f} to {low + 0.2:.1f}: {100 * within.mean():5.1f} % of the "
+                f"vertices, {100 * (errors[within] == 0).mean():5.1f} % exact, "
+                f"{100 * (errors[within] < 0.05).mean():5.1f} % within 0.05"
             )
-    return "\n".join(lines)
+    return lines
 
 
-def measured(matcher: Matcher, shapes: list[Shape], reference: ReferenceDistances, repair: bool):
+def measure(
+    matcher: Matcher, shapes: list[Shape], reference: ReferenceDistances, repair: bool = False
+) -> tuple[float, float, float]:
+    """The share of exact matches, the mean error, and the median seconds of labelling a mesh."""
     exact, errors, seconds = [], [], []
     for shape in tqdm(shapes, leave=False):
         began = time.perf_counter()
         labels = matcher.label(scan(shape.mesh.vertices, shape.mesh.faces, "a", repair))
         seconds.append(time.perf_counter() - began)
         known = labels.template >= 0
-        found = labels.template[known].astype(np.int64)
-        exact.append((found == shape.labels[known]).mean())
+        predicted = labels.template[known].astype(np.int64)
+        exact.append((predicted == shape.labels[known]).mean())
         if shape.points is None:
-            error = geodesic_errors(found, shape.labels[known], reference)
+            error = geodesic_errors(predicted, shape.labels[known], reference)
         else:
-            true = (array[known] for array in shape.points)
-            error = point_errors(found, *true, reference, reference.place)
+            true_points = (array[known] for array in shape.points)
+            error = point_errors(predicted, *true_points, reference, reference.place)
         errors.append(error.mean())
     return np.mean(exact), np.mean(errors), np.median(seconds)
 

@@ -1,34 +1,85 @@
-"""Each fast network against the same network written plainly: one loss, one gradient."""
+"""Each network against its reference: one loss, one gradient."""
 
 import pytest
 import torch
+from torch import nn
 
-from meshspiral.benchmarking.measure import fast_loss
-from meshspiral.benchmarking.reference import PlainNetwork
-from meshspiral.nn.networks import GCNN3, FCSNet, LSTMNet
-from tests.nn.test_geodesic import as_resampling, patches
-from tests.nn.test_layers import sequences
+from meshspiral.benchmarking import reference
+from meshspiral.benchmarking.inputs import build_network, torus_batch
+from meshspiral.benchmarking.reference import reference_loss, reference_network
+from meshspiral.benchmarking.steps import training_loss
+from meshspiral.data.datamodule import draw
+from meshspiral.neighbourhoods import Neighbourhood
+from tests.helpers import ROOT, composed
 
-NETWORKS = {
-    "fcs": lambda: FCSNet(10, 21, 6, channels=[5, 6, 7], dropout=0.0, feature_scale=2.0),
-    "lstm": lambda: LSTMNet(10, 21, channels=[5, 6, 7], dropout=0.0, feature_scale=2.0),
-    "gcnn3": lambda: GCNN3(10, 21, channels=[5, 6, 7], dropout=0.0, feature_scale=2.0),
-}
+MODELS = sorted(path.stem for path in (ROOT / "conf" / "model").glob("*.yaml"))
+VERTICES, CLASSES = 60, 21
 
 
-@pytest.mark.parametrize("name", NETWORKS)
-def test_losses_and_gradients_agree_to_1e_9(name):
+def in_double(entry):
+    if isinstance(entry, dict):
+        return {key: in_double(value) for key, value in entry.items()}
+    is_float = isinstance(entry, torch.Tensor) and entry.is_floating_point()
+    return entry.double() if is_float else entry
+
+
+def network_and_batch(model):
+    """A small network without dropout, in float64, and a batch for it."""
+    small = ["model.channels=[5,6,7]", "model.dropout=0", "seq_len=6", "data.shot.bins=1"]
+    config = composed([f"model={model}", *small])
+    batch = torus_batch(config, VERTICES, CLASSES)
+    batch = draw(Neighbourhood.of(config.neighbourhood), batch, 0)
     torch.manual_seed(0)
-    net = NETWORKS[name]().double()
-    plain = PlainNetwork(net)
-    features, labels = torch.randn(30, 10, dtype=torch.float64), torch.randint(21, (30,))
-    neighbourhood = (
-        as_resampling(*patches(30)) if name == "gcnn3" else sequences(30, 6, padded=False)
-    )
-    ours = fast_loss(net, features, neighbourhood, labels)
-    theirs = plain.loss(features, neighbourhood, labels)
+    return build_network(config, CLASSES).double(), in_double(batch)
+
+
+@pytest.mark.parametrize("model", MODELS)
+def test_losses_and_gradients_agree_to_1e_9(model):
+    net, batch = network_and_batch(model)
+    copy = reference_network(net)
+    ours, theirs = training_loss(net, batch), reference_loss(copy, batch)
     torch.testing.assert_close(ours, theirs, rtol=0, atol=1e-9)
     ours.backward(), theirs.backward()
-    for get in (lambda n: n.lift.weight, lambda n: n.neck.weight, lambda n: n.head.weight):
-        assert get(net).grad.abs().max() > 1e-6
-        torch.testing.assert_close(get(net).grad, get(plain).grad, rtol=0, atol=1e-9)
+    expected = dict(copy.named_parameters())
+    shared = {name: p for name, p in net.named_parameters() if name in expected}
+    assert {"lift.weight", "neck.weight", "head.weight"} <= shared.keys()
+    for name, parameter in shared.items():
+        assert parameter.grad.abs().max() > 1e-6, name
+        torch.testing.assert_close(parameter.grad, expected[name].grad, rtol=0, atol=1e-9)
+
+
+@pytest.mark.parametrize("model", ["fcs", "lstm", "gcnn3"])
+def test_every_layer_of_the_bundled_networks_has_a_reference(model):
+    net, _ = network_and_batch(model)
+    types = {type(layer) for layer in reference_network(net).layers}
+    assert types == {reference.REFERENCES[type(layer)] for layer in net.layers}
+    assert not types & {type(layer) for layer in net.layers}
+
+
+def test_a_layer_without_a_reference_stays(monkeypatch):
+    monkeypatch.setattr(reference, "REFERENCES", {})
+    net, batch = network_and_batch("fcs")
+    copy = reference_network(net)
+    assert [type(layer) for layer in copy.layers] == [type(layer) for layer in net.layers]
+    assert all(a is not b for a, b in zip(copy.parameters(), net.parameters(), strict=True))
+    torch.testing.assert_close(reference_loss(copy, batch), training_loss(net, batch))
+
+
+def test_the_reference_of_a_convolution_handles_missing_samples(monkeypatch):
+    """Windows differ in their number of vertices, and a sample may have none."""
+    from tests.nn.test_geodesic import as_resampling, patches
+
+    net, _ = network_and_batch("gcnn3")
+    layer, samples = net.layers[0], as_resampling(*patches(30, empty=0.4))
+    x = torch.randn(30, 16, dtype=torch.float64)
+    copy = reference.ReferenceGeodesicConv(layer)
+    torch.testing.assert_close(copy(x, samples), layer(x, samples), rtol=0, atol=1e-9)
+
+
+def test_references_are_modules_with_the_weights_of_their_layer():
+    net, _ = network_and_batch("fcs")
+    copy = reference_network(net)
+    with torch.no_grad():
+        for parameter in copy.parameters():
+            parameter.zero_()
+    assert isinstance(copy, nn.Module) and net.layers[0].linear.weight.abs().max() > 0

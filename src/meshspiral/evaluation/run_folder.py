@@ -9,7 +9,12 @@ from typing import Any
 from omegaconf import OmegaConf
 
 from meshspiral.data.files import write_file
-from meshspiral.experiment.schema import ConfigError, TrainConfig, read_stored_config
+from meshspiral.experiment.schema import (
+    ConfigError,
+    MissingPluginError,
+    TrainConfig,
+    read_stored_config,
+)
 
 CONFIG, METRICS = "config.yaml", "metrics.json"
 BEST, LAST = "checkpoints/best.ckpt", "checkpoints/last.ckpt"
@@ -66,6 +71,8 @@ def read_run_config(folder: Path) -> TrainConfig:
         raise RunError(f"{path} cannot be read ({str(error).splitlines()[0]})") from error
     try:
         return read_stored_config(stored, str(folder))
+    except MissingPluginError as error:
+        raise RunError(str(error)) from error
     except (ConfigError, AttributeError, KeyError, TypeError) as error:
         reason = str(error).splitlines()[0]
         raise RunError(f"{path} is not the config of a run ({reason})") from error

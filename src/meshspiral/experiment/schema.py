@@ -37,6 +37,10 @@ class ConfigError(ValueError):
     """A setting that cannot be used; the message names the key, the rule and the value."""
 
 
+class MissingPluginError(ConfigError):
+    """A stored config needs a plugin that was not imported; the message names it."""
+
+
 C = TypeVar("C", bound=BaseModel)
 
 
@@ -254,15 +258,15 @@ def read_stored_config(values: dict[str, Any], source: str = "the config") -> Tr
         source: Where it comes from, for messages.
 
     Raises:
-        ConfigError: As for `read_config`; or it names a network, neighbourhood or data set that
-            only a plugin defines. The message names the plugin.
+        ConfigError: As for `read_config`.
+        MissingPluginError: Only a plugin defines the network, neighbourhood or data set.
     """
     values = upgraded(_as_dict(values))
     for group, base in GROUPS.items():
         name = _name(values.get(group), group)
-        if name not in base.registered and values["plugins"]:
-            plugins = ",".join(values["plugins"])
-            raise ConfigError(
+        if name not in base.registered and values.get("plugins"):
+            plugins = ",".join(map(str, values["plugins"]))
+            raise MissingPluginError(
                 f"{source} needs {group} {name} of a plugin; to import it, add plugins=[{plugins}]"
             )
     return _read(TrainConfig, values)

@@ -1,0 +1,1 @@
+"""Surfaces in NumPy and numba: meshes, connectivity, spirals, descriptors, patches, remeshing."""

@@ -86,6 +86,8 @@ def config_of(saved: dict[str, Any], source: str = "the checkpoint") -> TrainCon
         return read_stored_config(saved["hyper_parameters"]["config"], source)
     except ConfigError as error:
         raise RunError(str(error)) from error
+    except (AttributeError, KeyError, TypeError) as error:
+        raise RunError(f"{source} has a damaged config ({error!r})") from error
 
 
 def template_of(saved: dict[str, Any]) -> Mesh:
