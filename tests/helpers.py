@@ -11,9 +11,9 @@ from pathlib import Path
 
 import torch
 
-from meshspiral.evaluation.run_folder import CONFIG, LAST
 from meshspiral.experiment.compose import CONF
 from meshspiral.experiment.compose import compose_train as composed
+from meshspiral.experiment.run_folder import CONFIG, LAST
 from meshspiral.experiment.runs import claim
 from meshspiral.training.run import train
 

@@ -104,3 +104,10 @@ def random_meshes() -> dict[str, Mesh]:
         "rags": punctured(torus(), 0.45, seed=2),
         "parts": union(triangle, tetrahedron, bumpy_sphere(2, 1), bow_tie(), two_cones()),
     }
+
+
+def icosphere(subdivisions=3):
+    import trimesh
+
+    sphere = trimesh.creation.icosphere(subdivisions=subdivisions)
+    return Mesh(sphere.vertices, sphere.faces)

@@ -5,7 +5,7 @@ import torch
 from torch import nn
 from torch.utils.flop_counter import FlopCounterMode
 
-from meshspiral.benchmarking.inputs import build_network, torus_batch
+from meshspiral.benchmarking.inputs import network_of, torus_batch
 from meshspiral.benchmarking.products import Product, ProductRecorder, replay
 from meshspiral.benchmarking.steps import training_loss, training_step
 from meshspiral.data.datamodule import draw
@@ -28,7 +28,7 @@ def loss_of(model):
     channels = f"model.channels=[{','.join(map(str, CHANNELS))}]"
     config = composed([f"model={model}", channels, f"seq_len={N}", "data.shot.bins=1"])
     batch = draw(Neighbourhood.of(config.neighbourhood), torus_batch(config, V, CLASSES), 0)
-    net = build_network(config, CLASSES)
+    net = network_of(config, CLASSES)
     return net, lambda: training_loss(net, batch)
 
 

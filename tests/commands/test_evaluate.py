@@ -9,7 +9,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 
 from meshspiral.commands.evaluate import main
 from meshspiral.data.cache import Cache
@@ -19,17 +18,12 @@ from meshspiral.data.shapes import DataError, Shape, ShapeSet, SurfacePoints
 from meshspiral.evaluation.metrics import THRESHOLDS, point_errors
 from meshspiral.evaluation.outcome import Outcome, Result, evenly, result_of, rotations
 from meshspiral.evaluation.retest import config_on_data
-from meshspiral.evaluation.run_folder import BEST, CONFIG, ERRORS, METRICS, RunError
+from meshspiral.experiment.run_folder import BEST, CONFIG, ERRORS, METRICS, RunError
 from meshspiral.experiment.schema import ConfigError
-from meshspiral.geometry.mesh import Mesh
 from meshspiral.neighbourhoods import Neighbourhood
 from meshspiral.training.checkpoints import template_of
-from meshspiral.viz.colors import error_colors
-from meshspiral.viz.plots import all_curves_figure, curve_figure, encoded, sketch_figure
-from meshspiral.viz.render import Row, render
 from tests.conftest import toy_shapes
 from tests.helpers import composed, run
-from tests.meshes import lattice
 
 SEED = 3
 REMESH = {"policy": "mixed", "vertices": 120, "copies": 1}
@@ -369,44 +363,6 @@ def test_shapes_are_chosen_evenly():
     names = list("abcdefghij")
     assert evenly(names, 4) == ["a", "d", "g", "j"]
     assert evenly(names, 100) == names and evenly(names, 1) == ["a"]
-
-
-def test_error_colours_darken_and_end_at_a_fifth():
-    grey = error_colors(np.linspace(0, 0.3, 31)) @ [0.299, 0.587, 0.114]
-    assert (np.diff(grey[:21]) < 0).all() and (np.diff(grey[20:]) == 0).all()
-
-
-def test_no_two_curves_look_alike_and_no_name_covers_one():
-    curves = {f"run {i}": (THRESHOLDS, np.full(len(THRESHOLDS), i / 24)) for i in range(24)}
-    figure = curve_figure(curves)
-    [axes] = figure.axes
-    assert len({(line.get_color(), line.get_linestyle()) for line in axes.lines}) == 24
-    FigureCanvasAgg(figure).draw()
-    [legend] = figure.legends
-    names = legend.get_window_extent()
-    assert len(legend.get_texts()) == 24
-    assert names.x0 >= axes.get_window_extent().x1 and names.y0 >= 0
-
-
-def test_curves_of_several_runs_have_a_band():
-    curves = np.stack([THRESHOLDS, THRESHOLDS / 2])
-    [axes] = curve_figure({"a": (THRESHOLDS, curves), "b": (THRESHOLDS, THRESHOLDS)}).axes
-    assert len(axes.collections) == 1 and len(axes.lines) == 2
-    np.testing.assert_allclose(axes.lines[0].get_ydata(), 75 * THRESHOLDS)
-    figure = all_curves_figure(THRESHOLDS, curves)
-    assert len(figure.axes[0].lines) == 2
-    assert encoded(figure, "svg") == encoded(figure, "svg")
-
-
-def test_a_flat_mesh_is_drawn():
-    mesh = lattice(4, 4)
-    rows = []
-    for axis in range(3):
-        flat = Mesh(np.insert(mesh.vertices[:, :2], axis, 0.0, axis=1), mesh.faces)
-        rows.append(Row([flat], [np.ones((16, 3))]))
-        assert encoded(sketch_figure(flat.vertices, flat.faces, rows[-1].colors[0]), "png")
-    for picture in render(rows, "y"):
-        assert picture.images[0].shape[1] < 25 * picture.images[0].shape[0]
 
 
 def test_a_checkpoint_knows_its_template(trained):

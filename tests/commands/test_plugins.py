@@ -13,7 +13,7 @@ import torch
 from omegaconf import OmegaConf
 
 from meshspiral.commands import evaluate, report
-from meshspiral.evaluation.run_folder import BEST, CONFIG, METRICS, RunError, read_run_config
+from meshspiral.experiment.run_folder import BEST, CONFIG, METRICS, RunError, read_run_config
 from meshspiral.nn.networks import Network
 from tests.helpers import QUICK, run
 

@@ -20,14 +20,21 @@ from omegaconf import OmegaConf
 
 from meshspiral.data.datamodule import draw
 from meshspiral.data.sources import open_data
-from meshspiral.evaluation.run_folder import BEST, CONFIG, LAST, METRICS, RunError, read_run_config
+from meshspiral.experiment.run_folder import (
+    BEST,
+    CONFIG,
+    LAST,
+    METRICS,
+    RunError,
+    Stopped,
+    read_run_config,
+)
 from meshspiral.experiment.runs import claim, resumed_config
 from meshspiral.experiment.schema import read_stored_config
 from meshspiral.training.callbacks import Looks, Speed
 from meshspiral.training.checkpoints import Checkpoint, WholeFiles
 from meshspiral.training.module import Correspondence
 from meshspiral.training.run import train
-from meshspiral.training.stopping import Stopped
 from tests import helpers
 from tests.helpers import ROOT, composed, program_process, run, same_weights, wait_for, weights
 
@@ -470,9 +477,7 @@ def test_without_opengl_there_is_no_picture_and_one_line_says_so(
 ):
     monkeypatch.setattr("meshspiral.viz.render._render", die)
     run(tmp_path, [*toy_overrides, "optim.epochs=1", "picture=true"])
-    assert (
-        "skipping renders: VTK failed; it needs an OpenGL library" in caplog.text
-    )
+    assert "skipping renders: VTK failed; it needs an OpenGL library" in caplog.text
     assert (tmp_path / METRICS).is_file()
 
 

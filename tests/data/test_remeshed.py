@@ -13,7 +13,7 @@ from meshspiral.data.pool import run_in_pool
 from meshspiral.data.remeshed import Remeshed, usual_size
 from meshspiral.data.shapes import DataError, ShapeSet, registered_shape
 from meshspiral.evaluation.outcome import Outcome
-from meshspiral.evaluation.run_folder import ERRORS, METRICS
+from meshspiral.experiment.run_folder import ERRORS, METRICS
 from meshspiral.geometry import remesh as module
 from tests import helpers
 from tests.conftest import toy_shapes

@@ -11,8 +11,8 @@ import torch
 from omegaconf import OmegaConf
 
 from meshspiral.data.settings import RemeshSettings, ShotSettings
-from meshspiral.evaluation.run_folder import write_metrics
 from meshspiral.experiment.help import COMMANDS
+from meshspiral.experiment.run_folder import write_metrics
 from meshspiral.experiment.schema import (
     GROUPS,
     ConfigError,

@@ -18,7 +18,15 @@ import torch
 from omegaconf import OmegaConf
 
 from meshspiral.commands.train import train_separately
-from meshspiral.evaluation.run_folder import BEST, CONFIG, LAST, METRICS, RunError, write_metrics
+from meshspiral.experiment.run_folder import (
+    BEST,
+    CONFIG,
+    LAST,
+    METRICS,
+    RunError,
+    Stopped,
+    write_metrics,
+)
 from meshspiral.experiment.runs import InUse, alone, claim
 from meshspiral.experiment.sweeps import (
     FAILED,
@@ -28,7 +36,6 @@ from meshspiral.experiment.sweeps import (
     sweep_folder,
 )
 from meshspiral.training.callbacks import OrderlyStop
-from meshspiral.training.stopping import Stopped
 from tests import helpers
 from tests.helpers import QUICK, ROOT, composed, program_process, run, wait_for, weights
 

@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 import meshspiral
 from meshspiral import Matcher, Mesh, open_scan, scan
 from meshspiral.data.datasets.bodies import Bodies
-from meshspiral.evaluation.run_folder import BEST, RunError
+from meshspiral.experiment.run_folder import BEST, RunError
 from meshspiral.geometry.mesh import MeshError
 from meshspiral.matching.matcher import Labels, nearest_vertices
 from tests.conftest import toy_shapes

@@ -16,7 +16,7 @@ import pytest
 import trimesh
 
 from meshspiral.commands.report import main
-from meshspiral.evaluation.run_folder import CONFIG, METRICS
+from meshspiral.experiment.run_folder import CONFIG, METRICS
 from meshspiral.nn.networks import FCSNet, Network
 from meshspiral.reporting.groups import data_labels, group_runs, length_keys, varied_settings
 from meshspiral.reporting.plots import compared_curves, file_name

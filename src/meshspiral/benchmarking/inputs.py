@@ -15,13 +15,12 @@ from meshspiral.geometry.mesh import Mesh
 from meshspiral.neighbourhoods import Neighbourhood
 from meshspiral.neighbourhoods.base import Arrays, Batch
 from meshspiral.nn.networks import Network
+from meshspiral.training.module import build_network
 
 
-def build_network(config: TrainConfig, num_classes: int) -> Network:
-    """The network of a config, for its descriptors."""
-    neighbourhood = Neighbourhood.of(config.neighbourhood)
-    network = Network.registered[config.model.name]
-    return network.build(config.model, neighbourhood, channels(config), num_classes)
+def network_of(config: TrainConfig, num_classes: int) -> Network:
+    """The network of a config, as in training."""
+    return build_network(config, channels(config), num_classes)
 
 
 def channels(config: TrainConfig) -> int:

@@ -67,7 +67,7 @@ def in_own_process(function: Callable[..., Any], *arguments: Any) -> Any:
     server = "forkserver" in get_all_start_methods()
     context = get_context("forkserver" if server else "spawn")
     if server:
-        context.set_forkserver_preload([function.__module__])
+        context.set_forkserver_preload(["meshspiral.benchmarking.scaling"])
     try:
         with ProcessPoolExecutor(1, mp_context=context) as pool:
             return pool.submit(function, *arguments).result()

@@ -7,7 +7,7 @@ import time
 
 from tqdm import tqdm
 
-from meshspiral.benchmarking.inputs import build_network, torus_batch
+from meshspiral.benchmarking.inputs import network_of, torus_batch
 from meshspiral.benchmarking.measure import Row, free_bytes, in_own_process, peak_bytes
 from meshspiral.benchmarking.reference import reference_loss, reference_network
 from meshspiral.benchmarking.steps import training_loss
@@ -18,7 +18,7 @@ from meshspiral.training.device import set_up_process
 
 log = logging.getLogger(__name__)
 
-LARGE = (20_000, 20_000)  # vertices of a mesh and of a template
+LARGE = (20_000, 100_000)  # vertices of a mesh and of a template
 
 
 def too_large(expected: float | None) -> bool:
@@ -96,7 +96,7 @@ def pass_cost(
     set_up_process(threads)
     batch = torus_batch(network, vertices, num_classes)
     batch = draw(Neighbourhood.of(network.neighbourhood), batch, network.seed)
-    net, loss = build_network(network, num_classes), training_loss
+    net, loss = network_of(network, num_classes), training_loss
     if reference:
         net, loss = reference_network(net), reference_loss
     began = time.perf_counter()

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from tqdm import tqdm
 
-from meshspiral.benchmarking.inputs import build_network, torus_batch
+from meshspiral.benchmarking.inputs import network_of, torus_batch
 from meshspiral.benchmarking.measure import Action, Row, in_own_process, medians, peak_bytes
 from meshspiral.benchmarking.memory import too_large
 from meshspiral.data.datamodule import draw
@@ -92,12 +92,14 @@ def scaling_rows(config: BenchmarkConfig, networks: list[TrainConfig]) -> list[R
 def exponent(sizes: list[int], values: list[float | None]) -> float | None:
     """The slope of a line through the upper half of the values, both axes logarithmic.
 
+    The line goes through two values at least.
+
     Returns:
-        The slope; None if a value is missing, or if there is one value only.
+        The slope; None if a value is missing, or if there is only one.
     """
-    upper = slice(len(sizes) // 2, None)
-    if None in values or len(sizes[upper]) < 2:
+    if None in values or len(values) < 2:
         return None
+    upper = slice(min(len(sizes) // 2, len(sizes) - 2), None)
     return float(np.polyfit(np.log(sizes[upper]), np.log(values[upper]), 1)[0])
 
 
@@ -134,7 +136,7 @@ def one_pass(series: Series, size: int, vertices: int) -> Action:
         network = network.model_copy(update={"neighbourhood": around})
     batch = torus_batch(network, vertices, TEMPLATE)
     batch = draw(Neighbourhood.of(network.neighbourhood), batch, network.seed)
-    net = build_network(network, num_classes=10)
+    net = network_of(network, num_classes=10)
     return lambda: net.embed_batch(batch).sum().backward()
 
 

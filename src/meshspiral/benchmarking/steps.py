@@ -9,7 +9,7 @@ import torch
 from torch import Tensor, nn
 from tqdm import tqdm
 
-from meshspiral.benchmarking.inputs import body_batch, build_network
+from meshspiral.benchmarking.inputs import body_batch, network_of
 from meshspiral.benchmarking.measure import Action, Row, medians
 from meshspiral.benchmarking.products import ProductRecorder, replay
 from meshspiral.benchmarking.reference import reference_loss, reference_network
@@ -63,7 +63,7 @@ def step_rows(config: BenchmarkConfig, networks: list[TrainConfig]) -> list[Row]
         neighbourhood = Neighbourhood.of(network.neighbourhood)
         drawing = partial(draw, neighbourhood, body_batch(network, device), network.seed)
         batch = drawing()
-        net = build_network(network, config.vertices).to(device)
+        net = network_of(network, config.vertices).to(device)
         reference = reference_network(net)
         ours = training_step(net, partial(training_loss, net, batch), precision)
         with ProductRecorder() as recorder:

@@ -25,7 +25,7 @@ def main(config: BenchmarkConfig) -> None:
     from meshspiral.benchmarking.steps import step_rows
     from meshspiral.benchmarking.table import table_lines
     from meshspiral.training.device import device_of, set_up_process
-    from meshspiral.viz.plots import growth_figure
+    from meshspiral.viz.plots import encoded, scaling_figure
 
     measure = {
         "steps": step_rows,
@@ -43,8 +43,9 @@ def main(config: BenchmarkConfig) -> None:
         rows = result[part] = measure[part](config, networks)
         log.info("%s", "\n".join(table_lines(part, rows)))
         write_file(folder / "benchmark.json", json.dumps(result, indent=2) + "\n")
-        if part == "scaling":
-            growth_figure(rows).savefig(folder / "scaling.png", dpi=150)
+        curves = [row for row in rows if part == "scaling" and len(row["sizes"]) > 1]
+        if curves:
+            write_file(folder / "scaling.png", encoded(scaling_figure(curves), "png"))
     log.info("%s", folder / "benchmark.json")
 
 

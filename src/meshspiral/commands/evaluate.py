@@ -5,8 +5,8 @@ from __future__ import annotations
 import logging
 from pathlib import Path
 
-from meshspiral.evaluation.run_folder import BEST, ERRORS, RunError, write_metrics
 from meshspiral.experiment.entry import entry_point
+from meshspiral.experiment.run_folder import BEST, ERRORS, RunError, write_metrics
 from meshspiral.experiment.schema import EvaluateConfig
 
 log = logging.getLogger(__name__)

@@ -10,9 +10,9 @@ import subprocess
 import sys
 from pathlib import Path
 
-from meshspiral.evaluation.run_folder import METRICS, RunError
 from meshspiral.experiment.entry import entry_point
 from meshspiral.experiment.program import command_line, module_of
+from meshspiral.experiment.run_folder import METRICS, RunError, Stopped
 from meshspiral.experiment.runs import (
     InUse,
     alone,
@@ -23,7 +23,6 @@ from meshspiral.experiment.runs import (
     resumed_config,
 )
 from meshspiral.experiment.schema import TrainConfig
-from meshspiral.training.stopping import Stopped
 
 log = logging.getLogger(__name__)
 

@@ -12,7 +12,7 @@ import numpy as np
 from meshspiral.data.files import write_arrays
 from meshspiral.data.reference import ReferenceDistances
 from meshspiral.evaluation.metrics import CorrespondenceError, geodesic_errors, point_errors
-from meshspiral.evaluation.run_folder import RunError
+from meshspiral.experiment.run_folder import RunError
 from meshspiral.neighbourhoods.base import Batch
 
 

@@ -25,7 +25,7 @@ from meshspiral.evaluation.outcome import (
     result_of,
     rotations,
 )
-from meshspiral.evaluation.run_folder import RunError
+from meshspiral.experiment.run_folder import RunError
 from meshspiral.experiment.schema import ConfigError, TrainConfig, read_stored_config
 from meshspiral.geometry.digest import digest
 from meshspiral.geometry.mesh import Mesh

@@ -22,13 +22,12 @@ from pydantic import BaseModel
 
 from meshspiral.data.files import write_file
 from meshspiral.data.shapes import DataError
-from meshspiral.evaluation.run_folder import RunError
 from meshspiral.experiment.compose import CONF
 from meshspiral.experiment.help import settings_help
+from meshspiral.experiment.run_folder import RunError, Stopped
 from meshspiral.experiment.schema import MOVED, ConfigError, read_config
 from meshspiral.experiment.sweeps import invocation, note_failure, number_failed, show_table
 from meshspiral.geometry.mesh import MeshError
-from meshspiral.training.stopping import Stopped
 
 USER_ERRORS = (
     ConfigError,

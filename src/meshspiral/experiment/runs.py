@@ -11,7 +11,7 @@ from typing import Any
 from filelock import FileLock, Timeout
 from omegaconf import DictConfig, OmegaConf
 
-from meshspiral.evaluation.run_folder import CONFIG, RunError, read_run_config, write_config
+from meshspiral.experiment.run_folder import CONFIG, RunError, read_run_config, write_config
 from meshspiral.experiment.schema import TrainConfig, flat, read_config
 
 # how and where a run is computed, which may change when it is resumed

@@ -19,8 +19,8 @@ from hydra.experimental.callback import Callback
 from omegaconf import DictConfig, OmegaConf
 
 from meshspiral.data.files import legal_name, write_file
-from meshspiral.evaluation.run_folder import CONFIG, LAST, METRICS
 from meshspiral.experiment.program import command_line
+from meshspiral.experiment.run_folder import CONFIG, LAST, METRICS
 from meshspiral.experiment.runs import in_use, is_first
 
 FAILED = "failed.txt"  # in the folder of a failed job: the reason, in one line

@@ -12,7 +12,7 @@ import numpy as np
 
 from meshspiral.data.attributes import KINDS, read_attribute
 from meshspiral.data.scans import Scan, open_scan
-from meshspiral.evaluation.run_folder import BEST
+from meshspiral.experiment.run_folder import BEST
 from meshspiral.experiment.schema import MatchConfig, read_config
 from meshspiral.geometry.digest import digest
 from meshspiral.geometry.mesh import MeshError

@@ -18,7 +18,7 @@ from scipy.spatial import cKDTree
 from meshspiral.data.datamodule import described_tensors
 from meshspiral.data.preprocessing import descriptor_task
 from meshspiral.data.scans import Scan
-from meshspiral.evaluation.run_folder import BEST
+from meshspiral.experiment.run_folder import BEST
 from meshspiral.experiment.schema import TrainConfig
 from meshspiral.geometry.barycentric import interpolate
 from meshspiral.geometry.mesh import Mesh

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from meshspiral.evaluation.outcome import Outcome
-from meshspiral.evaluation.run_folder import (
+from meshspiral.experiment.run_folder import (
     CONFIG,
     ERRORS,
     RunError,

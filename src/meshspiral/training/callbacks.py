@@ -13,8 +13,7 @@ from lightning.pytorch.callbacks import Callback, ProgressBar
 from tqdm import tqdm
 
 from meshspiral.evaluation.metrics import THRESHOLDS
-from meshspiral.evaluation.run_folder import LAST
-from meshspiral.training.stopping import Stopped
+from meshspiral.experiment.run_folder import LAST, Stopped
 from meshspiral.viz.colors import template_colors
 from meshspiral.viz.plots import curve_figure, sketch_figure
 from meshspiral.viz.render import upright

@@ -11,7 +11,7 @@ from lightning.pytorch.callbacks import ModelCheckpoint
 from lightning.pytorch.plugins.io import TorchCheckpointIO
 
 from meshspiral.data.files import atomic_file
-from meshspiral.evaluation.run_folder import BEST, CONFIG, RunError
+from meshspiral.experiment.run_folder import BEST, CONFIG, RunError
 from meshspiral.experiment.schema import ConfigError, TrainConfig, read_stored_config
 from meshspiral.geometry.mesh import Mesh
 

@@ -7,7 +7,7 @@ from typing import Any
 import torch
 
 from meshspiral.data.datamodule import draw
-from meshspiral.evaluation.run_folder import RunError
+from meshspiral.experiment.run_folder import RunError
 from meshspiral.experiment.schema import TrainConfig
 from meshspiral.neighbourhoods import Neighbourhood
 from meshspiral.neighbourhoods.base import Batch

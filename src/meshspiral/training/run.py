@@ -14,7 +14,7 @@ from meshspiral.data.datamodule import CorrespondenceData
 from meshspiral.data.sources import open_data
 from meshspiral.evaluation import summary
 from meshspiral.evaluation.outcome import Outcome, evenly
-from meshspiral.evaluation.run_folder import BEST, ERRORS, LAST, RunError, write_metrics
+from meshspiral.experiment.run_folder import BEST, ERRORS, LAST, RunError, write_metrics
 from meshspiral.experiment.schema import TrainConfig, flat
 from meshspiral.neighbourhoods import Neighbourhood
 from meshspiral.training.callbacks import Speed

@@ -98,11 +98,11 @@ def encoded(figure: Figure, kind: str) -> bytes:
     return buffer.getvalue()
 
 
-def growth_figure(series: list[dict]) -> Figure:
+def scaling_figure(series: list[dict]) -> Figure:
     """Log-log plots of seconds and megabytes over size; dashed lines show proportionality.
 
     Args:
-        series: As `meshspiral.benchmarking.scaling.growth` returns them.
+        series: As `meshspiral.benchmarking.scaling.scaling_rows` returns them.
     """
     overs, units = list(dict.fromkeys(row["over"] for row in series)), ("seconds", "MB")
     figure = Figure(figsize=(3.4 * len(overs), 6.2), layout="constrained")

@@ -1,4 +1,4 @@
-"""The files of a run folder: their names, and how to read and write them."""
+"""A run folder: the names of its files, how to read and write them, and what ends a run."""
 
 from __future__ import annotations
 
@@ -19,6 +19,19 @@ from meshspiral.experiment.schema import (
 CONFIG, METRICS = "config.yaml", "metrics.json"
 BEST, LAST = "checkpoints/best.ckpt", "checkpoints/last.ckpt"
 ERRORS = "errors.npz"
+
+
+class Stopped(BaseException):
+    """The run was asked to stop, by Ctrl-C or SIGTERM.
+
+    Args:
+        signum: Number of the signal.
+        message: What to tell the user, e.g. how to resume.
+    """
+
+    def __init__(self, signum: int, message: str = "Stopped."):
+        super().__init__(message)
+        self.signum = signum
 
 
 class RunError(ValueError):

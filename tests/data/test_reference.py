@@ -1,0 +1,58 @@
+"""Geodesic distances on the template: unit, cache, memory, components."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from meshspiral.data.cache import Cache
+from meshspiral.data.reference import BLOCK, ReferenceDistances
+from meshspiral.geometry.geodesics import GeodesicSolver
+from meshspiral.geometry.mesh import Mesh
+from tests.meshes import icosphere, union
+
+
+@pytest.fixture
+def reference(tmp_path):
+    return ReferenceDistances(icosphere(), Cache(tmp_path))
+
+
+def test_reference_distances_are_over_the_square_root_of_the_area(reference):
+    mesh = reference.template
+    rng = np.random.default_rng(0)
+    sources, targets = rng.integers(0, len(mesh.vertices), (2, 200))
+    exact = np.arccos(np.clip((mesh.vertices[sources] * mesh.vertices[targets]).sum(1), -1, 1))
+    distances = reference(sources, targets)
+    np.testing.assert_allclose(distances, exact / np.sqrt(mesh.area), atol=0.03)
+    assert reference.diameter == pytest.approx(np.pi / np.sqrt(mesh.area), rel=0.02)
+    scaled = ReferenceDistances(Mesh(1000 * mesh.vertices, mesh.faces), reference._cache)
+    np.testing.assert_allclose(scaled(sources, targets), distances, rtol=1e-4, atol=1e-6)
+
+
+def test_only_requested_rows_are_computed_and_they_are_cached(reference, monkeypatch):
+    computed = []
+    row = GeodesicSolver.row
+    monkeypatch.setattr(GeodesicSolver, "row", lambda s, v: computed.append(v) or row(s, v))
+    reference(np.array([3, 3]), np.array([3, 9]))
+    assert computed == list(range(BLOCK))
+    reference(np.array([7]), np.array([1]))
+    again = ReferenceDistances(reference.template, reference._cache)
+    again(np.array([3]), np.array([9]))
+    again(np.array([600]), np.array([600]))  # source and target are equal
+    assert len(computed) == BLOCK
+
+
+def test_the_rows_in_memory_are_bounded(reference, monkeypatch):
+    monkeypatch.setattr("meshspiral.data.reference.IN_MEMORY", 1)
+    rng = np.random.default_rng(1)
+    sources, targets = rng.integers(0, 642, (2, 50))
+    bounded = reference(sources, targets)
+    assert len(reference._blocks) == 1
+    monkeypatch.setattr("meshspiral.data.reference.IN_MEMORY", 2**30)
+    np.testing.assert_array_equal(reference(sources, targets), bounded)
+    assert len(reference._blocks) == 3
+
+
+def test_a_pair_on_two_components_counts_as_the_diameter(tmp_path):
+    reference = ReferenceDistances(union(icosphere(1), icosphere(1)), Cache(tmp_path))
+    assert reference(np.array([0]), np.array([50]))[0] == pytest.approx(reference.diameter)
