@@ -229,7 +229,7 @@ def test_a_network_too_large_for_the_memory_is_omitted_with_a_warning(monkeypatc
     assert "fcs at 20000 vertices: omitted, it would take about 13.3 GB" in caplog.text
     title, heads, *lines = table_lines("memory", [ours, reference, large])
     assert title == "\nmemory" and heads.split()[:3] == ["network", "vertices", "template"]
-    assert re.fullmatch(r"  fcs +20000 +20000 +True +- +- +-", lines[2])
+    assert re.fullmatch(r"  fcs +20000 +100000 +True +- +- +-", lines[2])
 
 
 @pytest.mark.parametrize(

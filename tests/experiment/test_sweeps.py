@@ -266,7 +266,7 @@ def test_a_job_of_several_processes_at_which_others_are_has_not_failed(tmp_path,
     monkeypatch.setattr(sys, "executable", "false")  # what it runs ends with 1
     with alone(tmp_path), pytest.raises(InUse):
         train_separately(tmp_path, [])
-    with pytest.raises(RunError, match=r"ended with exit code 1; see .*train\*\.log"):
+    with pytest.raises(RunError, match=r"exit code 1; the reason is in .*train\*\.log"):
         train_separately(tmp_path, [])
 
 

@@ -48,7 +48,7 @@ class Remeshed(ShapeSet):
         try:
             self._version = version("pymeshlab")
         except PackageNotFoundError as error:
-            raise DataError("remeshing needs PyMeshLab: pip install -e '.[remesh]'") from error
+            raise DataError("remeshing needs PyMeshLab: pip install pymeshlab") from error
         self._base, self._cache, self._workers = base, cache, workers
         self._policy = policy
         self._vertices = vertices or usual_size(len(base.template.vertices))

@@ -135,7 +135,7 @@ def one_line(error: BaseException) -> str:
         for i, line in enumerate(lines):
             if line.startswith("Available options in"):
                 options = itertools.takewhile(lambda x: "search path" not in x, lines[i + 1 :])
-                extra = "; others need pip install -e '.[parallel,cluster]'"
+                extra = "; others need pip install hydra-joblib-launcher hydra-submitit-launcher"
                 hint = extra if "hydra/launcher" in lines[0] else ""
                 return f"{lines[0]}; there are: {', '.join(options)}{hint}"
         if lines[0].startswith(("mismatched input", "token recognition", "no viable")):

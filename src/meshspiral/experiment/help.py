@@ -9,6 +9,7 @@ from pydantic import BaseModel
 
 from meshspiral.data.settings import DataSettings, RemeshSettings, ShotSettings
 from meshspiral.data.shapes import ShapeSet
+from meshspiral.experiment.program import command_line
 from meshspiral.experiment.schema import (
     BenchmarkConfig,
     EvaluateConfig,
@@ -46,7 +47,11 @@ def settings_help(command: str, conf: Path) -> str:
         if line.startswith("#")
     ]
     about = [line for line in intro if not line.startswith("python -m")]
-    examples = [f"  {line}" for line in intro if line.startswith("python -m")]
+    examples = [
+        "  " + line.replace(f"python -m src.{command}", command_line(command))
+        for line in intro
+        if line.startswith("python -m")
+    ]
     lines = [*about, "", "Examples:", *examples]
     if groups := _groups(command, conf):
         lines += ["", "Groups (choose with group=option):", *groups]

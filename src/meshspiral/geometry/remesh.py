@@ -208,7 +208,7 @@ class Tool:
         try:
             import pymeshlab
         except ImportError as error:
-            raise MeshError("remeshing needs PyMeshLab: pip install -e '.[remesh]'") from error
+            raise MeshError("remeshing needs PyMeshLab: pip install pymeshlab") from error
         self._lab, self.source, self.vertices, self._rng = pymeshlab, mesh, vertices, rng
         self.area = mesh.area
         self.edge = mean_edge(self.area, vertices)
