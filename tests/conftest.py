@@ -1,4 +1,4 @@
-"""A toy data set: small closed surfaces, deformed, that a network learns in seconds."""
+"""Shared fixtures: a toy data set that a network learns in seconds, and the command line."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import signal
 import sys
 from pathlib import Path
 
-os.environ.setdefault("OMP_NUM_THREADS", "1")  # read by torch: tests run on all cores already
+os.environ.setdefault("OMP_NUM_THREADS", "1")  # read by torch; the tests run in parallel
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""Running the program in tests, in this process or in others."""
+"""Helpers that run the program, in this process or in others."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ METRICS = {
     "seconds/preprocess",
     "seconds/train",
 }
-STARTED: list[subprocess.Popen] = []  # by tests, in sessions of their own; killed after each test
+STARTED: list[subprocess.Popen] = []  # in sessions of their own; killed after each test
 
 
 def run(folder: Path, overrides: list[str]) -> dict[str, float]:
@@ -84,6 +84,6 @@ def wait_for(condition: Callable[[], bool], process: subprocess.Popen, seconds: 
 
 
 def clone_environment() -> dict[str, str]:
-    """Environment variables with which a process finds the clone from any folder."""
+    """Environment variables that let a process import this clone from any folder."""
     paths = [str(ROOT), str(ROOT / "src"), os.environ.get("PYTHONPATH", "")]
     return {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, paths))}

@@ -1,5 +1,4 @@
-"""The notebooks run, from a run folder or two meshes to pictures; they are committed without
-outputs."""
+"""The notebooks run, and are committed without outputs."""
 
 from __future__ import annotations
 
@@ -7,7 +6,7 @@ import nbformat
 import pytest
 from nbclient import NotebookClient
 
-from tests.commands.test_train import ROOT, run
+from tests.helpers import ROOT, run
 
 NOTEBOOKS = sorted((ROOT / "notebooks").glob("*.ipynb"))
 

@@ -1,4 +1,4 @@
-"""Evaluating a run folder: metrics, files, other data sets, rotations, plugins, messages."""
+"""The command `evaluate`: metrics, files, other data sets, rotations, and error messages."""
 
 from __future__ import annotations
 
@@ -46,25 +46,25 @@ def trained(tmp_path_factory, toy_overrides):
 
 @pytest.fixture
 def moved(trained, tmp_path):
-    """A copy of the run, elsewhere."""
+    """A copy of the run in another folder."""
     return Path(shutil.copytree(trained[0], tmp_path / "moved")), trained[1]
 
 
-def test_evaluating_a_run_folder_gives_its_metrics_again(cli, moved):
+def test_evaluate_reproduces_the_metrics_of_a_run(cli, moved):
     folder, metrics = moved
     code, out, err = cli(f"run={folder}", "shapes=0", program=main)
     assert code == 0, err
-    written = folder / "evaluation" / "folder"
-    again = json.loads((written / METRICS).read_text())
+    output = folder / "evaluation" / "folder"
+    again = json.loads((output / METRICS).read_text())
     assert len(again) == 6
     assert again == pytest.approx({key: metrics[key] for key in again}, rel=1e-6)
-    assert json.loads((folder / METRICS).read_text()) == metrics  # the run's own file stays
-    old, new = Outcome.load(folder / ERRORS), Outcome.load(written / ERRORS)
+    assert json.loads((folder / METRICS).read_text()) == metrics  # the run's own file is unchanged
+    old, new = Outcome.load(folder / ERRORS), Outcome.load(output / ERRORS)
     np.testing.assert_array_equal(old.predicted, new.predicted)
     assert f"{100 * metrics['test/exact_match']:.2f} %" in out
     for kind, begin in {"png": b"\x89PNG", "pdf": b"%PDF", "svg": b"<?xml"}.items():
-        assert (written / f"curve.{kind}").read_bytes().startswith(begin)
-    assert not (written / "errors.png").exists()
+        assert (output / f"curve.{kind}").read_bytes().startswith(begin)
+    assert not (output / "errors.png").exists()
 
 
 @pytest.mark.parametrize(
@@ -72,7 +72,7 @@ def test_evaluating_a_run_folder_gives_its_metrics_again(cli, moved):
     [["trainer.precision=64"], ["model=lstm"], ["model=gcnn3", "neighbourhood.radius=0.2"]],
     ids=lambda overrides: overrides[0],
 )
-def test_evaluating_any_network_gives_its_metrics_again(cli, toy_overrides, tmp_path, overrides):
+def test_evaluate_reproduces_the_metrics_of_every_network(cli, toy_overrides, tmp_path, overrides):
     metrics = run(tmp_path / "run", [*toy_overrides, "optim.epochs=1", *overrides])
     code, _, err = cli(f"run={tmp_path / 'run'}", "shapes=0", program=main)
     assert code == 0, err
@@ -80,7 +80,7 @@ def test_evaluating_any_network_gives_its_metrics_again(cli, toy_overrides, tmp_
     assert again == pytest.approx({key: metrics[key] for key in again}, rel=1e-6)
 
 
-def test_errors_npz_holds_each_vertex(trained):
+def test_errors_npz_holds_the_error_of_every_vertex(trained):
     folder, metrics = trained
     outcome = Outcome.load(folder / ERRORS)
     assert outcome.names == ["test_0", "test_1", "test_2"]
@@ -108,27 +108,27 @@ def test_another_data_set_with_the_same_template_can_be_tested(cli, moved, toy):
     ]
     code, _, err = cli(f"run={folder}", *other, "shapes=0", program=main)
     assert code == 0, err
-    [written] = (folder / "evaluation").iterdir()
-    assert written.name.startswith("folder-")  # not where its own test set would go
-    again = json.loads((written / METRICS).read_text())
+    [output] = (folder / "evaluation").iterdir()
+    assert output.name.startswith("folder-")  # not the folder of its own test set
+    again = json.loads((output / METRICS).read_text())
     assert again["test/exact_match"] == pytest.approx(metrics["val/exact_match"])
     assert again["test/geodesic_error"] == pytest.approx(metrics["val/geodesic_error"])
-    assert Outcome.load(written / ERRORS).names != Outcome.load(folder / ERRORS).names
+    assert Outcome.load(output / ERRORS).names != Outcome.load(folder / ERRORS).names
 
 
-def test_rotations_draw_other_spirals_each_time(cli, moved):
+def test_each_rotation_uses_other_spirals(cli, moved):
     folder, metrics = moved
     code, out, err = cli(f"run={folder}", "rotations=4", "shapes=0", program=main)
     assert code == 0, err
-    written = folder / "evaluation" / "folder"
-    repeated = json.loads((written / METRICS).read_text())
+    output = folder / "evaluation" / "folder"
+    repeated = json.loads((output / METRICS).read_text())
     assert repeated["rotations/runs"] == 4
     assert 0 < repeated["rotations/unchanged"] < 1
     assert repeated["rotations/exact_match/spread"] > 0
     assert repeated["rotations/exact_match/mean"] == pytest.approx(
         metrics["test/exact_match"], abs=0.1
     )
-    assert (written / "rotations.pdf").is_file()
+    assert (output / "rotations.pdf").is_file()
     assert f"{100 * repeated['rotations/unchanged']:.2f} % of the vertices" in out
 
 
@@ -171,28 +171,28 @@ def test_rotations_pool_meshes_and_compare_runs():
         (["run=moved", "accelerator=abacus"], "accelerator must be one of cpu, gpu, got abacus"),
     ],
 )
-def test_a_mistake_is_one_clear_line(cli, moved, tmp_path, arguments, message):
+def test_a_mistake_gives_a_one_line_error(cli, moved, tmp_path, arguments, message):
     (tmp_path / "empty").mkdir()
     (tmp_path / "begun").mkdir()
     shutil.copy(moved[0] / CONFIG, tmp_path / "begun")
     shutil.copytree(moved[0], tmp_path / "damaged")
-    whole = (moved[0] / BEST).read_bytes()
-    (tmp_path / "damaged" / BEST).write_bytes(whole[: len(whole) // 2])
+    intact = (moved[0] / BEST).read_bytes()
+    (tmp_path / "damaged" / BEST).write_bytes(intact[: len(intact) // 2])
     code, out, err = cli(*arguments, program=main)
     assert code == 1
     assert message in (out + err).strip().splitlines()[-1]
     assert "Traceback" not in out + err
 
 
-def test_a_data_set_that_moved_can_be_named(cli, toy, toy_overrides, tmp_path):
-    here = Path(shutil.copytree(toy, tmp_path / "here"))
-    overrides = [o.replace(str(toy), str(here)) for o in toy_overrides]
+def test_a_moved_data_set_is_found_with_data_root(cli, toy, toy_overrides, tmp_path):
+    old_root = Path(shutil.copytree(toy, tmp_path / "here"))
+    overrides = [o.replace(str(toy), str(old_root)) for o in toy_overrides]
     run(tmp_path / "run", [*overrides, "optim.epochs=1"])
-    there = here.rename(tmp_path / "there")
+    new_root = old_root.rename(tmp_path / "there")
     code, out, _ = cli("run=run", "shapes=0", program=main)
     last = out.strip().splitlines()[-1]
-    assert code == 1 and str(here) in last and last.endswith("has moved, add data.root=")
-    code, _, err = cli("run=run", "shapes=0", f"data.root={there}", program=main)
+    assert code == 1 and str(old_root) in last and last.endswith("has moved, add data.root=")
+    code, _, err = cli("run=run", "shapes=0", f"data.root={new_root}", program=main)
     assert code == 0, err
 
 
@@ -206,13 +206,13 @@ def test_rotations_need_random_neighbourhoods(cli, toy_overrides, tmp_path):
     assert code == 1 and message in out + err
 
 
-def test_a_damaged_errors_npz_is_one_clear_line(trained, tmp_path):
-    whole = (trained[0] / ERRORS).read_bytes()
-    damaged = {"half": whole[: len(whole) // 2], "text": b"no", "empty": b""}
+def test_a_damaged_errors_npz_is_rejected(trained, tmp_path):
+    intact = (trained[0] / ERRORS).read_bytes()
+    damaged = {"half": intact[: len(intact) // 2], "text": b"no", "empty": b""}
     rng = np.random.default_rng(0)
-    for i in rng.integers(len(whole), size=60):
-        damaged[f"byte_{i}"] = whole[:i] + bytes([whole[i] ^ 255]) + whole[i + 1 :]
-    refused = 0
+    for i in rng.integers(len(intact), size=60):
+        damaged[f"byte_{i}"] = intact[:i] + bytes([intact[i] ^ 255]) + intact[i + 1 :]
+    rejected = 0
     for name, content in damaged.items():
         (tmp_path / name).write_bytes(content)
         try:
@@ -220,13 +220,13 @@ def test_a_damaged_errors_npz_is_one_clear_line(trained, tmp_path):
             assert len(outcome.predicted) == outcome.first[-1]
         except RunError as error:
             assert f"{name} is damaged" in str(error)
-            refused += 1
-    assert refused > 40
+            rejected += 1
+    assert rejected > 40
     with pytest.raises(RunError, match="does not exist"):
         Outcome.load(tmp_path / "nowhere")
 
 
-def test_arrays_of_different_lengths_are_no_outcome(trained, tmp_path):
+def test_arrays_of_different_lengths_are_rejected(trained, tmp_path):
     with np.load(trained[0] / ERRORS) as file:
         arrays = dict(file)
     np.savez(tmp_path / "short.npz", **arrays | {"errors": arrays["errors"][:-1]})
@@ -289,11 +289,11 @@ def test_requested_data_settings_are_checked(toy_overrides, requested, message):
         config_on_data(composed(toy_overrides), requested)
 
 
-# ------------------------------------------------------------------- the truth within a face
+# ---------------------------------------------------------- labels that are points within faces
 
 
-class Blurred(ShapeSet):
-    """The template itself, its truth moved into a face beside each vertex."""
+class LabelledWithPoints(ShapeSet):
+    """The template, labelled with points: each lies in a face, near the labelled vertex."""
 
     def __init__(self):
         self.template = toy_shapes()["template.ply"]
@@ -309,64 +309,64 @@ class Blurred(ShapeSet):
 
 
 @pytest.fixture
-def blurred(tmp_path):
+def point_data(tmp_path):
     spirals = Neighbourhood.registered["spiral"]
     neighbourhood = spirals(spirals.Settings(name="spiral", seq_len=8, rings=None))
     shot = ShotSettings(radius=0.3, bins=4)
-    return CorrespondenceData(Blurred(), shot, neighbourhood, Cache(tmp_path), workers=1)
+    return CorrespondenceData(LabelledWithPoints(), shot, neighbourhood, Cache(tmp_path), workers=1)
 
 
 @pytest.mark.parametrize("shuffled", [False, True])
-def test_an_error_is_measured_to_the_point_and_to_the_label_beside_it(blurred, shuffled):
-    blurred.shuffle_vertices = shuffled
-    blurred.prepare(["test"])
-    item = blurred.datasets["test"][0]
-    labels, positions = item["labels"].numpy(), blurred.reference.place
-    result = result_of(labels, item, blurred.reference)
+def test_errors_are_measured_to_the_point_and_to_the_labelled_vertex(point_data, shuffled):
+    point_data.shuffle_vertices = shuffled
+    point_data.prepare(["test"])
+    item = point_data.datasets["test"][0]
+    labels, positions = item["labels"].numpy(), point_data.reference.place
+    result = result_of(labels, item, point_data.reference)
     assert (result.label_errors == 0).all()
     point = np.einsum("vk,vkx->vx", item["weights"], positions[item["corners"]])
     np.testing.assert_allclose(result.errors, np.linalg.norm(point - positions[labels], axis=1))
-    outcome = Outcome.of(["c"], [item], {0: result}, blurred.reference.diameter)
+    outcome = Outcome.of(["c"], [item], {0: result}, point_data.reference.diameter)
     metrics, curve = outcome.metrics()
     assert metrics["geodesic_error"] > 0 == metrics["geodesic_error_to_label"]
     assert metrics["exact_match"] == 1 and curve[0] == 0
 
 
-def test_the_distance_to_a_point_lies_between_those_to_its_corners(blurred):
-    reference, template = blurred.reference, blurred.shapes.template
+def test_the_distance_to_a_point_is_interpolated_from_those_to_its_corners(point_data):
+    reference, template = point_data.reference, point_data.shapes.template
     corners = template.faces[:50]
     predicted = np.full(50, 160)
-    near = (corners == 160).any(axis=1)
-    each = np.stack([reference(corner, predicted) for corner in corners.T], axis=1)
+    at_predicted = (corners == 160).any(axis=1)
+    to_corners = np.stack([reference(corner, predicted) for corner in corners.T], axis=1)
     error = point_errors(predicted, corners, np.full((50, 3), 1 / 3), reference, reference.place)
-    np.testing.assert_allclose(error[~near], each[~near].mean(axis=1))
+    np.testing.assert_allclose(error[~at_predicted], to_corners[~at_predicted].mean(axis=1))
     at_corner = point_errors(
         predicted, corners, np.eye(3)[np.zeros(50, int)], reference, reference.place
     )
-    np.testing.assert_allclose(at_corner[~near], each[~near, 0], rtol=1e-6)
+    np.testing.assert_allclose(at_corner[~at_predicted], to_corners[~at_predicted, 0], rtol=1e-6)
 
 
 def test_points_must_be_on_the_template():
     mesh = toy_shapes()["template.ply"]
-    labels, ones = np.arange(162), np.ones((162, 3)) / 3
+    labels, weights = np.arange(162), np.ones((162, 3)) / 3
     for corners in (np.full((162, 3), 162), np.full((162, 3), -1)):
         with pytest.raises(DataError, match=r"162 points outside 0\.\.161"):
-            Shape(mesh, labels, 162, SurfacePoints(corners, ones))
+            Shape(mesh, labels, 162, SurfacePoints(corners, weights))
     with pytest.raises(DataError, match="162 vertices but points"):
-        Shape(mesh, labels, 162, SurfacePoints(np.zeros((9, 3), int), ones))
+        Shape(mesh, labels, 162, SurfacePoints(np.zeros((9, 3), int), weights))
 
 
-# ----------------------------------------------------------------------------------- pictures
+# ------------------------------------------------------------------ rendered shapes, checkpoints
 
 
-def test_shapes_are_chosen_evenly():
+def test_rendered_shapes_are_chosen_evenly():
     names = list("abcdefghij")
     assert evenly(names, 4) == ["a", "d", "g", "j"]
     assert evenly(names, 100) == names and evenly(names, 1) == ["a"]
 
 
-def test_a_checkpoint_knows_its_template(trained):
+def test_a_checkpoint_holds_the_template_and_no_optimizer_state(trained):
     saved = torch.load(trained[0] / BEST, weights_only=True)
     faces = toy_shapes()["template.ply"].faces
     np.testing.assert_array_equal(template_of(saved).faces, faces)
-    assert saved["resolution"] > 0 and "optimizer_states" not in saved
+    assert saved["resolution"] == 162 and "optimizer_states" not in saved

@@ -1,4 +1,4 @@
-"""The command `meshes`: its table, and one message for a mistake."""
+"""The command `meshes`: its table and its error messages."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ def test_every_statistic_has_a_column():
     assert len(COLUMNS) == len(MeshStatistics._fields)
 
 
-def test_the_meshes_of_a_data_set_in_a_table(cli, toy_overrides):
+def test_the_table_shows_every_mesh_of_a_split(cli, toy_overrides):
     data = [o for o in toy_overrides if o.startswith("data") and "shot" not in o]
     code, out, err = cli(*data, *REMESH, "split=test", program=main)
     assert code == 0, err
@@ -43,6 +43,6 @@ def test_the_meshes_of_a_data_set_in_a_table(cli, toy_overrides):
         ([REMESHED, "+data.remesh.depth=3"], "unknown key data.remesh.depth"),
     ],
 )
-def test_a_mistake_gives_one_message(cli, arguments, message):
+def test_a_mistake_gives_a_one_line_error(cli, arguments, message):
     code, out, err = cli(*arguments, program=main)
     assert code == 1 and message in (out + err).strip().splitlines()[-1]

@@ -1,4 +1,4 @@
-"""Runs of a plugin: evaluate and report import it only if their own command line names it."""
+"""Runs that need a plugin: evaluate and report import it only if their command line names it."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def trained(tmp_path_factory, toy_overrides):
 def foreign(trained, tmp_path, monkeypatch):
     """Two folders below runs/: "ours", and "foreign" with a network of a plugin.
 
-    The plugin's module lies in tmp_path and leaves a file when it is imported.
+    The plugin's module lies in tmp_path and creates the file `imported` when it is imported.
     """
     monkeypatch.setattr(sys, "path", [*sys.path])
     monkeypatch.setattr(Network, "registered", {**Network.registered})
@@ -67,7 +67,7 @@ def rename_model(folder: Path, name: str, plugins: list[str]) -> None:
     torch.save(saved, folder / BEST)
 
 
-def test_evaluate_imports_no_plugin_that_its_command_line_does_not_name(cli, foreign, tmp_path):
+def test_evaluate_does_not_import_a_plugin_that_only_the_run_names(cli, foreign, tmp_path):
     code, out, err = cli(f"run={foreign}", "shapes=0", program=evaluate.main)
     [line] = (out + err).strip().splitlines()
     assert code == 1 and NEEDED in line
@@ -82,14 +82,14 @@ def test_evaluate_imports_the_plugin_that_its_command_line_names(cli, foreign, t
     assert again == pytest.approx({key: trained[1][key] for key in again}, rel=1e-6)
 
 
-def test_evaluate_imports_no_plugin_that_a_run_names_without_need(cli, foreign, tmp_path):
+def test_evaluate_does_not_import_a_plugin_that_the_run_does_not_need(cli, foreign, tmp_path):
     rename_model(foreign, "fcs", ["stranger.module"])
     code, _, err = cli(f"run={foreign}", "shapes=0", program=evaluate.main)
     assert code == 0, err
     assert not (tmp_path / "imported").exists() and "stranger.module" not in sys.modules
 
 
-def test_report_omits_a_run_of_a_plugin_and_says_which(cli, foreign, tmp_path):
+def test_report_omits_a_run_that_needs_a_plugin_and_names_it(cli, foreign, tmp_path):
     code, out, err = cli("runs=runs", "shapes=0", program=report.main)
     assert code == 0, err
     assert "Runs:    1, 1 omitted" in out
@@ -99,7 +99,7 @@ def test_report_omits_a_run_of_a_plugin_and_says_which(cli, foreign, tmp_path):
     assert not (tmp_path / "imported").exists() and "stranger.module" not in sys.modules
 
 
-def test_report_shows_a_run_of_a_plugin_that_its_command_line_names(cli, foreign, tmp_path):
+def test_report_shows_a_run_whose_plugin_the_command_line_names(cli, foreign, tmp_path):
     code, out, err = cli("runs=runs", "shapes=0", *PLUGINS, program=report.main)
     assert code == 0, err
     assert "Runs:    2, 0 omitted" in out
@@ -108,7 +108,7 @@ def test_report_shows_a_run_of_a_plugin_that_its_command_line_names(cli, foreign
 
 
 @pytest.mark.parametrize("program, key", [(evaluate.main, "run"), (report.main, "runs")])
-def test_a_network_that_no_plugin_is_named_for_is_one_clear_line(cli, foreign, program, key):
+def test_an_unknown_network_without_a_plugin_gives_a_one_line_error(cli, foreign, program, key):
     rename_model(foreign, "other", [])
     code, out, err = cli(f"{key}={foreign}", "shapes=0", program=program)
     [line] = (out + err).strip().splitlines()
@@ -116,7 +116,7 @@ def test_a_network_that_no_plugin_is_named_for_is_one_clear_line(cli, foreign, p
 
 
 @pytest.mark.parametrize("group", ["model", "neighbourhood", "data"])
-def test_a_run_folder_names_the_plugin_of_each_group(foreign, group):
+def test_the_error_names_the_plugin_and_the_group_that_needs_it(foreign, group):
     config = OmegaConf.load(foreign / CONFIG)
     config.model.name = "fcs"
     config[group].name = "other"

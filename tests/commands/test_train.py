@@ -1,4 +1,4 @@
-"""The main program: what a run leaves behind, and that it can be repeated and continued."""
+"""The command `train`: the files of a run, its repeatability, resuming, and learning."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ from tests.helpers import ROOT, composed, program_process, run, same_weights, wa
 
 @pytest.fixture(scope="module")
 def whole_run(tmp_path_factory, toy_overrides):
-    """A run that nothing interrupts."""
+    """An uninterrupted run: its folder and its metrics."""
     folder = tmp_path_factory.mktemp("whole")
     return folder, run(folder, toy_overrides)
 
@@ -49,7 +49,7 @@ def whole_run(tmp_path_factory, toy_overrides):
 # -------------------------------------------------------------------------------- the run folder
 
 
-def test_a_run_folder_holds_what_is_promised(whole_run):
+def test_a_run_folder_holds_metrics_checkpoints_and_logs(whole_run):
     folder, metrics = whole_run
     assert metrics.keys() >= helpers.METRICS
     assert json.loads((folder / METRICS).read_text()) == metrics
@@ -61,16 +61,16 @@ def test_a_run_folder_holds_what_is_promised(whole_run):
     assert not list(folder.rglob("*.tmp"))
 
 
-def test_metrics_hold_the_validation_of_the_best_checkpoint_and_the_time_of_all_training(whole_run):
+def test_metrics_hold_the_best_validation_and_the_total_training_time(whole_run):
     folder, metrics = whole_run
     saved = {name: torch.load(folder / name, weights_only=True) for name in (BEST, LAST)}
-    metrics_, curve = saved[BEST]["validation"]
-    assert metrics_.items() <= metrics.items()
-    assert curve[0] == pytest.approx(metrics_["val/exact_match"])
+    validation, curve = saved[BEST]["validation"]
+    assert validation.items() <= metrics.items()
+    assert curve[0] == pytest.approx(validation["val/exact_match"])
     assert metrics["seconds/train"] > saved[LAST]["callbacks"]["Speed"]["seconds"]
 
 
-def test_what_is_logged_can_be_seen_in_tensorboard(whole_run):
+def test_metrics_and_plots_are_logged_to_tensorboard(whole_run):
     from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
     events = EventAccumulator(str(whole_run[0])).Reload()
@@ -93,8 +93,8 @@ def test_what_is_logged_can_be_seen_in_tensorboard(whole_run):
     assert events.Images("val/curve") and events.Images("val/shape") and events.Images("test/curve")
 
 
-def test_pictures_in_tensorboard_take_one_per_cent_of_the_time_at_most():
-    """But for the last: there are new ones only once those before have become cheap."""
+def test_plots_in_tensorboard_take_at_most_one_per_cent_of_the_time():
+    """New plots wait until the earlier ones took less than 1 % of the time since the start."""
     looks, drawn = Looks(), []
     looks._curve = lambda *arguments: (drawn.append(1), time.sleep(0.05))
     trainer = SimpleNamespace(state=SimpleNamespace(fn="fit"), is_global_zero=False)
@@ -102,20 +102,20 @@ def test_pictures_in_tensorboard_take_one_per_cent_of_the_time_at_most():
     looks.on_validation_end(trainer, None)
     looks.on_validation_end(trainer, None)
     assert len(drawn) == 1
-    looks._began -= 80 * looks._spent  # as if so much time had gone by
+    looks._began -= 80 * looks._spent  # as if that much time had passed
     looks.on_validation_end(trainer, None)
     assert len(drawn) == 1
     looks._began -= 30 * looks._spent
     looks.on_validation_end(trainer, None)
     assert len(drawn) == 2
-    trainer.state.fn = "validate"  # on its own
+    trainer.state.fn = "validate"  # validation outside training
     looks._began -= 600
     looks.on_validation_end(trainer, None)
     assert len(drawn) == 2
 
 
-def test_a_checkpoint_is_all_that_evaluation_needs(whole_run):
-    """The figures of metrics.json again, from best.ckpt alone and by other means."""
+def test_metrics_can_be_recomputed_from_the_checkpoint_alone(whole_run):
+    """From best.ckpt, without the evaluation code of the program."""
     folder, metrics = whole_run
     saved = torch.load(folder / BEST, weights_only=True)["hyper_parameters"]
     assert saved["config"] == OmegaConf.to_container(OmegaConf.load(folder / CONFIG))
@@ -135,7 +135,7 @@ def test_a_checkpoint_is_all_that_evaluation_needs(whole_run):
     assert torch.stack(losses).mean().item() == pytest.approx(metrics["test/loss"], rel=1e-4)
 
 
-def test_geodesic_errors_over_area_and_over_diameter_have_one_ratio(whole_run):
+def test_the_ratio_of_the_two_geodesic_errors_is_the_diameter(whole_run):
     folder, metrics = whole_run
     config = read_run_config(folder)
     data = open_data(config)
@@ -143,8 +143,8 @@ def test_geodesic_errors_over_area_and_over_diameter_have_one_ratio(whole_run):
     assert ratio == pytest.approx(data.reference.diameter, rel=1e-5)
 
 
-def test_validation_figures_are_of_one_epoch_and_all_its_meshes(whole_run):
-    """Those that last.ckpt brings, from its weights by a fresh module."""
+def test_validation_metrics_cover_one_epoch_and_all_its_meshes(whole_run):
+    """A fresh module with the weights of last.ckpt gives the metrics stored in last.ckpt."""
     folder, _ = whole_run
     config = read_run_config(folder)
     data = open_data(config)
@@ -178,19 +178,19 @@ def test_the_learning_rate_warms_up_and_follows_half_a_cosine(whole_run, toy_ove
         assert event.value == pytest.approx(rate, rel=1e-5)
 
 
-def test_dropout_differs_between_meshes_and_epochs_and_not_between_runs(toy_overrides):
+def test_dropout_differs_between_meshes_and_epochs_but_not_between_runs(toy_overrides):
     config = composed(toy_overrides).model_dump()
     module = Correspondence(config, 160, 162)
 
-    def draw(mesh):
+    def random_number(mesh):
         module.on_train_batch_start({"index": mesh}, 0)
         return torch.rand(1).item()
 
-    assert len({draw(mesh) for mesh in range(5)}) == 5
-    assert draw(2) == draw(2)
-    before = draw(2)
+    assert len({random_number(mesh) for mesh in range(5)}) == 5
+    assert random_number(2) == random_number(2)
+    before = random_number(2)
     module._trainer = SimpleNamespace(current_epoch=1)
-    assert draw(2) != before
+    assert random_number(2) != before
 
 
 # ---------------------------------------------------------------------------------- repeatability
@@ -210,7 +210,7 @@ def test_two_runs_with_one_seed_agree_to_the_bit_and_another_seed_differs(
 
 
 @pytest.mark.parametrize("model", ["fcs", "lstm", "gcnn3"])
-def test_so_do_runs_of_all_networks_on_two_threads(model, toy_overrides, tmp_path):
+def test_runs_of_all_networks_agree_on_two_threads(model, toy_overrides, tmp_path):
     threads = torch.get_num_threads()
     several = ["trainer.threads=2", "model.channels=[100,150,200]", "optim.epochs=2"]
     for name in "ab":
@@ -220,7 +220,7 @@ def test_so_do_runs_of_all_networks_on_two_threads(model, toy_overrides, tmp_pat
     assert same_weights(tmp_path / "a", tmp_path / "b")
 
 
-STEPS = 6  # an epoch of the toy data set has as many
+STEPS = 6  # per epoch of the toy data set
 
 
 @pytest.mark.parametrize(
@@ -228,14 +228,14 @@ STEPS = 6  # an epoch of the toy data set has as many
     [(signal.SIGINT, step) for step in (1, 2, STEPS - 1, STEPS, STEPS + 3, 4 * STEPS)]
     + [(signal.SIGTERM, 2), (signal.SIGTERM, STEPS)],
 )
-def test_a_stopped_run_resumes_as_if_it_had_not_been_stopped(
+def test_a_stopped_run_resumes_to_the_same_weights(
     whole_run, toy_overrides, tmp_path, monkeypatch, signum, step
 ):
-    """Ctrl-C after the first step, in the middle, at the end of an epoch, and after the last."""
-    end = Speed.on_train_batch_end
+    """Stopped after the first step, within an epoch, at its end, and after the last step."""
+    original = Speed.on_train_batch_end
 
     def stop(self, trainer, *args):
-        end(self, trainer, *args)
+        original(self, trainer, *args)
         if trainer.global_step == step:
             os.kill(os.getpid(), signum)
 
@@ -246,7 +246,7 @@ def test_a_stopped_run_resumes_as_if_it_had_not_been_stopped(
     assert (tmp_path / LAST).is_file() and not (tmp_path / METRICS).exists()
     saved = torch.load(tmp_path / LAST, weights_only=True)
     assert saved["global_step"] == (6 if step == STEPS - 1 else step)  # see OrderlyStop
-    monkeypatch.setattr(Speed, "on_train_batch_end", end)
+    monkeypatch.setattr(Speed, "on_train_batch_end", original)
     metrics = run(tmp_path, toy_overrides)
     assert same_weights(whole_run[0], tmp_path)
     for name in helpers.METRICS - {"seconds/preprocess", "seconds/train"}:
@@ -255,7 +255,7 @@ def test_a_stopped_run_resumes_as_if_it_had_not_been_stopped(
 
 
 def test_a_killed_run_resumes_to_the_same_weights(toy_overrides, tmp_path):
-    """A real process, a real kill -9, and resume=<run folder> on the command line."""
+    """A separate process, killed with SIGKILL; resumed with resume=<run folder>."""
     overrides = [*toy_overrides, "optim.epochs=12"]
     run(tmp_path / "whole", overrides)
     folder = tmp_path / "killed"
@@ -298,21 +298,23 @@ def test_a_stopped_program_says_how_to_resume(toy_overrides, tmp_path, signum, c
     torch.load(folder / LAST, weights_only=True)
 
 
-def test_a_checkpoint_that_cannot_be_written_leaves_the_last_one(tmp_path, monkeypatch):
+def test_a_failed_write_leaves_the_previous_checkpoint(tmp_path, monkeypatch):
     io = WholeFiles()
     io.save_checkpoint({"a": torch.ones(3)}, tmp_path / "last.ckpt")
 
-    def full(descriptor):
+    def disk_full(descriptor):
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(os, "fsync", full)
+    monkeypatch.setattr(os, "fsync", disk_full)
     with pytest.raises(OSError, match=r"cannot write the checkpoint .*last\.ckpt \(No space left"):
         io.save_checkpoint({"a": torch.zeros(3)}, tmp_path / "last.ckpt")
     assert torch.load(tmp_path / "last.ckpt", weights_only=True)["a"].sum() == 3
     assert [p.name for p in tmp_path.iterdir()] == ["last.ckpt"]
 
 
-def test_a_damaged_checkpoint_is_one_message(whole_run, toy_overrides, tmp_path):
+def test_a_checkpoint_that_is_damaged_or_of_another_run_is_rejected(
+    whole_run, toy_overrides, tmp_path
+):
     folder, _ = whole_run
     config = composed(toy_overrides)
     for damage, message in [(lambda b: b[:-500], "is damaged"), (lambda b: b"no", "is damaged")]:
@@ -331,19 +333,21 @@ def test_a_damaged_checkpoint_is_one_message(whole_run, toy_overrides, tmp_path)
         train(composed([*toy_overrides, "seq_len=9"]), tmp_path)
 
 
-def test_a_run_folder_that_was_moved_keeps_its_best_checkpoint(whole_run, tmp_path):
+def test_a_moved_run_folder_keeps_its_best_checkpoint(whole_run, tmp_path):
     callbacks = torch.load(whole_run[0] / LAST, weights_only=True)["callbacks"]
     [state] = [s for key, s in callbacks.items() if "val/geodesic_error" in key]
     assert Path(state["best_model_path"]) == whole_run[0] / BEST
     moved = Checkpoint(tmp_path / "checkpoints", "best", monitor="val/geodesic_error")
     moved.load_state_dict(state)
     assert moved.best_model_score == state["best_model_score"] < 1
-    here = str(tmp_path / BEST)
-    assert moved.best_model_path == moved.kth_best_model_path == here
-    assert moved.best_k_models == {here: state["best_model_score"]}
+    path = str(tmp_path / BEST)
+    assert moved.best_model_path == moved.kth_best_model_path == path
+    assert moved.best_k_models == {path: state["best_model_score"]}
 
 
-def test_resume_takes_the_runs_config_and_only_harmless_changes(tmp_path, toy_overrides):
+def test_resume_uses_the_config_of_the_run_and_allows_only_harmless_changes(
+    tmp_path, toy_overrides
+):
     claim(tmp_path, composed(toy_overrides))
     resume = [f"resume={tmp_path}"]
     assert resumed_config(composed(resume), resume).model.channels == [12, 14, 16]
@@ -360,12 +364,12 @@ def test_resume_takes_the_runs_config_and_only_harmless_changes(tmp_path, toy_ov
             resumed_config(composed(overrides), overrides)
 
 
-def test_a_run_from_before_a_setting_was_added_resumes(tmp_path, toy_overrides):
+def test_a_run_older_than_a_setting_resumes(tmp_path, toy_overrides):
     config = composed(toy_overrides)
     claim(tmp_path, config)
-    before = OmegaConf.load(tmp_path / CONFIG)
-    del before.data.shuffle_vertices, before.model.metric_layers, before.picture
-    OmegaConf.save(before, tmp_path / CONFIG)
+    old = OmegaConf.load(tmp_path / CONFIG)
+    del old.data.shuffle_vertices, old.model.metric_layers, old.picture
+    OmegaConf.save(old, tmp_path / CONFIG)
     claim(tmp_path, config)
     resume = [f"resume={tmp_path}"]
     assert resumed_config(composed(resume), resume).model.metric_layers == "all"
@@ -384,19 +388,19 @@ def test_a_run_from_before_a_setting_was_added_resumes(tmp_path, toy_overrides):
     ],
 )
 def test_a_run_of_version_0_1_resumes(tmp_path, toy_overrides, overrides, old_model):
-    """Its config had no group `neighbourhood`: these were settings of the model."""
+    """Version 0.1 had no group `neighbourhood`; its settings belonged to the model."""
     config = composed([*toy_overrides, *overrides])
     claim(tmp_path, config)
-    before = OmegaConf.load(tmp_path / CONFIG)
-    del before.neighbourhood, before.plugins
-    before.model.update(old_model)
-    OmegaConf.save(before, tmp_path / CONFIG)
+    old = OmegaConf.load(tmp_path / CONFIG)
+    del old.neighbourhood, old.plugins
+    old.model.update(old_model)
+    OmegaConf.save(old, tmp_path / CONFIG)
     claim(tmp_path, config)
     resume = [f"resume={tmp_path}"]
     assert resumed_config(composed(resume), resume) == config
 
 
-def test_resuming_a_folder_that_is_no_run_is_one_message(tmp_path):
+def test_resuming_a_folder_that_is_not_a_run_is_rejected(tmp_path):
     for path, message in [(tmp_path / "none", "is not a folder"), (tmp_path, "is not a run")]:
         overrides = [f"resume={path}"]
         with pytest.raises(RunError, match=message):
@@ -442,13 +446,15 @@ def test_every_variant_trains(toy_overrides, tmp_path, overrides):
 LEARN = ["optim.epochs=60", "optim.lr=0.01", "model.dropout=0.1", "trainer.val_every=20"]
 
 
-def test_a_network_learns_and_the_numbering_does_not_help_it(toy_overrides, tmp_path):
-    """With every mesh renumbered at random the figures agree within noise."""
-    plain = run(tmp_path / "plain", [*toy_overrides, *LEARN])
+def test_a_network_learns_independently_of_the_numbering(toy_overrides, tmp_path):
+    """The metrics with every mesh randomly renumbered agree within noise."""
+    original = run(tmp_path / "original", [*toy_overrides, *LEARN])
     shuffled = run(tmp_path / "shuffled", [*toy_overrides, *LEARN, "data.shuffle_vertices=true"])
-    assert plain["test/exact_match"] > 0.6  # chance: 0.006
-    assert shuffled["test/exact_match"] == pytest.approx(plain["test/exact_match"], abs=0.12)
-    assert shuffled["test/geodesic_error"] == pytest.approx(plain["test/geodesic_error"], abs=0.06)
+    assert original["test/exact_match"] > 0.6  # chance: 0.006
+    assert shuffled["test/exact_match"] == pytest.approx(original["test/exact_match"], abs=0.12)
+    assert shuffled["test/geodesic_error"] == pytest.approx(
+        original["test/geodesic_error"], abs=0.06
+    )
 
 
 def test_gcnn3_learns(toy_overrides, tmp_path):
@@ -457,34 +463,34 @@ def test_gcnn3_learns(toy_overrides, tmp_path):
     assert metrics["test/exact_match"] > 0.5  # chance: 0.006
 
 
-def test_the_picture_is_drawn_without_a_display(toy_overrides, tmp_path, monkeypatch):
+def test_renders_need_no_display(toy_overrides, tmp_path, monkeypatch):
     monkeypatch.delenv("DISPLAY", raising=False)
     run(tmp_path, [*toy_overrides, "optim.epochs=1", "picture=true"])
     import matplotlib.image
 
     for name in ("correspondence.png", "errors.png"):
-        picture = matplotlib.image.imread(tmp_path / name)[..., :3]
-        assert (picture < 0.95).any(axis=2).mean() > 0.05  # something stands on the white ground
-        assert picture.std(axis=(0, 1)).min() > 0.02
+        image = matplotlib.image.imread(tmp_path / name)[..., :3]
+        assert (image < 0.95).any(axis=2).mean() > 0.05  # the background is white
+        assert image.std(axis=(0, 1)).min() > 0.02
 
 
-def die(*arguments):
-    os._exit(139)  # as VTK does, with a segmentation fault
+def crash(*arguments):
+    os._exit(139)  # the exit code of a segmentation fault, as in VTK
 
 
-def test_without_opengl_there_is_no_picture_and_one_line_says_so(
+def test_without_opengl_renders_are_skipped_with_a_warning(
     toy_overrides, tmp_path, monkeypatch, caplog
 ):
-    monkeypatch.setattr("meshspiral.viz.render._render", die)
+    monkeypatch.setattr("meshspiral.viz.render._render", crash)
     run(tmp_path, [*toy_overrides, "optim.epochs=1", "picture=true"])
     assert "skipping renders: VTK failed; it needs an OpenGL library" in caplog.text
     assert (tmp_path / METRICS).is_file()
 
 
 def test_freed_memory_stays_with_the_process():
-    """Where the C library is GNU's; elsewhere nothing is promised."""
+    """Only glibc has the setting for it."""
     if platform.libc_ver()[0] != "glibc":
-        pytest.skip("another C library")
+        pytest.skip("needs glibc")
     script = (
         "import resource, torch; from meshspiral.training.device import *; keep_freed_memory()\n"
         "for i in range(20):\n"
@@ -493,4 +499,4 @@ def test_freed_memory_stays_with_the_process():
         "print(resource.getrusage(resource.RUSAGE_SELF).ru_minflt - first)"
     )
     done = subprocess.run([sys.executable, "-c", script], cwd=ROOT, capture_output=True, text=True)
-    assert int(done.stdout) < 9 * 2**14  # one such tensor has 2**14 pages, and 18 were made
+    assert int(done.stdout) < 9 * 2**14  # a tensor has 2**14 pages; 18 are counted

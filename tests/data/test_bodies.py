@@ -57,6 +57,7 @@ def euler_characteristic(mesh: Mesh) -> int:
 
 
 def components(mesh: Mesh) -> int:
+    """The number of connected components."""
     smallest = np.arange(len(mesh.vertices))
     while True:
         spread = smallest.copy()
@@ -70,7 +71,7 @@ def components(mesh: Mesh) -> int:
 def test_bodies_are_closed_manifolds_of_genus_0(bodies):
     """`Mesh` checks the winding and that edges have one or two faces; 3 F = 2 E implies two.
 
-    All bodies share one connectivity, so the topology of the template is that of all.
+    All bodies have the connectivity of the template, and so its topology.
     """
     mesh = bodies.template
     edges = np.unique(np.sort(mesh.faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)), axis=0)

@@ -1,4 +1,4 @@
-"""What a network is served: the right tensors, fresh spirals, and nothing of the numbering."""
+"""The data module: its tensors, random spirals, vertex numbering, cache, and bad input."""
 
 import importlib
 import logging
@@ -42,49 +42,49 @@ class Toy(ShapeSet):
         return Shape(Mesh(mesh.vertices, mesh.faces, name), np.arange(162), 162)
 
 
-def serve(store, neighbourhood=None, seed=0, shapes=None, **options):
+def prepared(cache, neighbourhood=None, seed=0, shapes=None, **options):
     neighbourhood = neighbourhood or spiral(8)
-    data = CorrespondenceData(Toy(shapes), SHOT, neighbourhood, store, seed, workers=1, **options)
+    data = CorrespondenceData(Toy(shapes), SHOT, neighbourhood, cache, seed, workers=1, **options)
     data.prepare()
     return data
 
 
 @pytest.fixture
-def store(tmp_path):
+def cache(tmp_path):
     return Cache(tmp_path)
 
 
 class Recorder(L.LightningModule):
-    """Notes what it is served."""
+    """Records the batches of every split."""
 
     def __init__(self):
         super().__init__()
         self.weight = torch.nn.Parameter(torch.zeros(()))
-        self.seen = {"train": [], "val": []}
+        self.batches = {"train": [], "val": []}
 
-    def note(self, split, batch):
-        self.seen[split].append((batch["index"], batch["spirals"].clone(), self.current_epoch))
+    def record(self, split, batch):
+        self.batches[split].append((batch["index"], batch["spirals"].clone(), self.current_epoch))
 
     def training_step(self, batch, i):
-        self.note("train", batch)
+        self.record("train", batch)
         return self.weight * batch["features"].sum()
 
     def validation_step(self, batch, i):
-        self.note("val", batch)
+        self.record("val", batch)
 
     def configure_optimizers(self):
         return torch.optim.SGD(self.parameters(), lr=0.1)
 
 
-def served(data, epochs=2):
+def recorded(data, epochs=2):
     module = Recorder()
     trainer = L.Trainer(max_epochs=epochs, accelerator="cpu", logger=False, barebones=True)
     trainer.fit(module, datamodule=data)
-    return module.seen
+    return module.batches
 
 
-def test_items_hold_what_they_say(store):
-    data = serve(store)
+def test_items_hold_descriptors_spirals_and_labels(cache):
+    data = prepared(cache)
     assert {s: len(d) for s, d in data.datasets.items()} == TOY_SPLIT
     item = data.datasets["train"][1]
     mesh = data.shapes.load("train/1.ply").mesh
@@ -110,37 +110,37 @@ def test_items_hold_what_they_say(store):
     assert data.num_classes == 162 and data.in_features == item["features"].shape[1] == 32 * 5
 
 
-def test_meshes_of_one_connectivity_share_one_table(store):
-    data = serve(store)
+def test_meshes_of_one_connectivity_share_one_table(cache):
+    data = prepared(cache)
     tables = {item["sequences"].data_ptr() for d in data.datasets.values() for item in d.items}
-    assert len(tables) == 1 and len(list((store.root / "spiral").iterdir())) == 1
+    assert len(tables) == 1 and len(list((cache.root / "spiral").iterdir())) == 1
 
 
-def test_training_draws_anew_in_every_iteration_and_validation_never(store):
-    seen = served(serve(store), epochs=3)
-    assert len(seen["train"]) == 18
-    first = {index: spirals for index, spirals, epoch in seen["train"] if epoch == 0}
-    for index, spirals, epoch in seen["train"]:
+def test_training_draws_new_spirals_in_every_epoch_and_validation_never(cache):
+    batches = recorded(prepared(cache), epochs=3)
+    assert len(batches["train"]) == 18
+    first = {index: spirals for index, spirals, epoch in batches["train"] if epoch == 0}
+    for index, spirals, epoch in batches["train"]:
         if epoch > 0:
             assert (spirals[:, 1] != first[index][:, 1]).float().mean() > 0.5
     validated = {}
-    for index, spirals, _ in seen["val"]:
+    for index, spirals, _ in batches["val"]:
         assert torch.equal(validated.setdefault(index, spirals), spirals)
     assert not torch.equal(validated[0], validated[1])
-    orders = [[i for i, _, e in seen["train"] if e == epoch] for epoch in range(3)]
+    orders = [[i for i, _, e in batches["train"] if e == epoch] for epoch in range(3)]
     assert all(sorted(order) == list(range(6)) for order in orders)
     assert orders[0] != orders[1] or orders[1] != orders[2]
 
 
-def test_one_seed_one_run_and_another_another(store):
-    a, b, c = (served(serve(store, seed=seed))["train"] for seed in (3, 3, 4))
+def test_the_seed_determines_the_order_and_the_spirals(cache):
+    a, b, c = (recorded(prepared(cache, seed=seed))["train"] for seed in (3, 3, 4))
     assert all(x[0] == y[0] and torch.equal(x[1], y[1]) for x, y in zip(a, b, strict=True))
     assert [x[0] for x in a] != [x[0] for x in c]  # the order, and for each mesh the spirals
-    spirals = [{index: drawn for index, drawn, epoch in s if epoch == 0} for s in (a, c)]
-    assert not any(torch.equal(spirals[0][i], spirals[1][i]) for i in range(6))
+    one, other = ({index: drawn for index, drawn, epoch in s if epoch == 0} for s in (a, c))
+    assert not any(torch.equal(one[i], other[i]) for i in range(6))
 
 
-def test_a_sampler_that_skips_goes_on_where_it_was():
+def test_a_sampler_resumes_after_the_skipped_items():
     whole, rest = EpochSampler(10, 5), EpochSampler(10, 5, skip=4)
     for epoch in (2, 3):
         whole.set_epoch(epoch), rest.set_epoch(epoch)
@@ -153,21 +153,23 @@ def test_processes_divide_an_epoch_among_them(size, world):
     samplers = [EpochSampler(size, 5, rank=rank, world=world) for rank in range(world)]
     parts = [list(sampler) for sampler in samplers]
     assert {len(part) for part in parts} == {len(samplers[0])} == {-(-size // world)}
-    served = [i for part in parts for i in part]
-    assert set(served) == set(range(size)) and len(served) - size < world
+    indices = [i for part in parts for i in part]
+    assert set(indices) == set(range(size)) and len(indices) - size < world
 
 
 # -------------------------------------------------------------------------------- the numbering
 
 
-def test_renumbered_meshes_give_renumbered_tensors(store):
-    """Nothing depends on vertex numbers: descriptors, labels and spirals move along."""
-    plain, shuffled = serve(store), serve(store, shuffle_vertices=True)
-    for a, b in zip(plain.datasets["train"].items, shuffled.datasets["train"].items, strict=True):
-        order = b["labels"]  # vertex i of the shuffled mesh is vertex order[i] of the plain one
+def test_renumbered_meshes_give_renumbered_tensors(cache):
+    """Descriptors, labels and spirals are renumbered with the vertices."""
+    original, shuffled = prepared(cache), prepared(cache, shuffle_vertices=True)
+    for a, b in zip(
+        original.datasets["train"].items, shuffled.datasets["train"].items, strict=True
+    ):
+        order = b["labels"]  # shuffled vertex i is original vertex order[i]
         assert not torch.equal(order, a["labels"]) and torch.equal(order.sort()[0], a["labels"])
         torch.testing.assert_close(b["vertices"], a["vertices"][order])
-        # sums run in another order, and a vote on the border of a cell may fall to the other side
+        # sums have another order; rounding may move a point across the border of a SHOT cell
         rows = (b["features"] - a["features"][order]).abs().amax(1)
         assert (rows < 1e-4).float().mean() > 0.99
         for v in range(0, 162, 5):
@@ -177,8 +179,8 @@ def test_renumbered_meshes_give_renumbered_tensors(store):
             assert sorted(ours) == sorted(theirs)
 
 
-def test_every_mesh_is_shuffled_in_its_own_way_and_the_same_way_again(store):
-    once, twice = (serve(store, shuffle_vertices=True).datasets["train"].items for _ in range(2))
+def test_every_mesh_has_its_own_reproducible_permutation(cache):
+    once, twice = (prepared(cache, shuffle_vertices=True).datasets["train"].items for _ in range(2))
     assert all(torch.equal(a["labels"], b["labels"]) for a, b in zip(once, twice, strict=True))
     assert not torch.equal(once[0]["labels"], once[1]["labels"])
 
@@ -186,14 +188,14 @@ def test_every_mesh_is_shuffled_in_its_own_way_and_the_same_way_again(store):
 # ------------------------------------------------------------------------------------ the cache
 
 
-def test_a_second_run_computes_nothing(store, monkeypatch):
-    serve(store)
+def test_a_second_run_computes_nothing(cache, monkeypatch):
+    prepared(cache)
     monkeypatch.setattr(preprocessing, "_descriptors", None)
     monkeypatch.setattr(Spiral, "compute", None)
-    serve(store)
+    prepared(cache)
 
 
-def test_keys_depend_on_every_parameter():
+def test_cache_keys_depend_on_every_parameter():
     mesh = bumpy_sphere()
     settings = [SHOT, ShotSettings(radius=0.31, bins=4), ShotSettings(radius=0.3, bins=5)]
     assert len({descriptor_task(mesh, each).key for each in settings}) == 3
@@ -203,7 +205,7 @@ def test_keys_depend_on_every_parameter():
     assert len({neighbourhood_task(mesh, each).key for each in neighbourhoods}) == 9
 
 
-def test_keys_depend_on_content_and_code_and_not_on_the_name(monkeypatch):
+def test_cache_keys_depend_on_content_and_code_but_not_on_the_name(monkeypatch):
     mesh = bumpy_sphere()
     moved = Mesh(mesh.vertices + 1e-9, mesh.faces)
     named = Mesh(mesh.vertices, mesh.faces, "another")
@@ -222,8 +224,8 @@ def test_keys_depend_on_content_and_code_and_not_on_the_name(monkeypatch):
     assert not set(keys(mesh)) & set(before)
 
 
-def test_keys_depend_on_the_code_of_every_class_of_a_neighbourhood(tmp_path, monkeypatch):
-    """Also on that of a subclass in a module of the user's."""
+def test_cache_keys_depend_on_the_code_of_every_class_of_a_neighbourhood(tmp_path, monkeypatch):
+    """Also of a subclass in a user's module."""
     source = """
 from meshspiral.neighbourhoods.spiral import Spiral
 
@@ -239,19 +241,19 @@ class Backwards(Spiral):
     assert len({*keys, neighbourhood_task(mesh, spiral(8)).key}) == 3
 
 
-def test_a_damaged_result_is_computed_again(store, caplog):
-    before = serve(store).datasets["val"][0]["features"]
-    for path in (store.root / "shot").iterdir():
+def test_a_damaged_cache_file_is_recomputed(cache, caplog):
+    before = prepared(cache).datasets["val"][0]["features"]
+    for path in (cache.root / "shot").iterdir():
         path.write_bytes(path.read_bytes()[:1000])
     with caplog.at_level(logging.WARNING):
-        assert torch.equal(serve(store).datasets["val"][0]["features"], before)
+        assert torch.equal(prepared(cache).datasets["val"][0]["features"], before)
     assert "computing it again" in caplog.text
 
 
-def test_the_pool_computes_what_one_process_computes(tmp_path, monkeypatch):
-    alone = serve(Cache(tmp_path / "alone"))
-    clock = iter(range(0, 10**6, 100))
-    monkeypatch.setattr(preprocessing.time, "perf_counter", lambda: next(clock))  # "this is slow"
+def test_the_pool_gives_the_results_of_one_process(tmp_path, monkeypatch):
+    alone = prepared(Cache(tmp_path / "alone"))
+    clock = iter(range(0, 10**6, 100))  # all tasks seem slow
+    monkeypatch.setattr(preprocessing.time, "perf_counter", lambda: next(clock))
     data = CorrespondenceData(Toy(), SHOT, spiral(8), Cache(tmp_path / "pool"), workers=2)
     started = []
     run_in_pool = preprocessing.run_in_pool
@@ -272,7 +274,7 @@ def test_the_pool_computes_what_one_process_computes(tmp_path, monkeypatch):
 # ------------------------------------------------------------------------------------- bad input
 
 
-def test_undefined_descriptors_become_zeros_and_are_counted_once(store, caplog):
+def test_undefined_descriptors_become_zeros_and_are_counted_once(cache, caplog):
     shapes = toy_shapes()
     mesh = shapes["train/0.ply"]
     far = mesh.vertices.copy()
@@ -280,49 +282,49 @@ def test_undefined_descriptors_become_zeros_and_are_counted_once(store, caplog):
     far[0] += 50  # so far from all others that its neighbourhood is empty
     shapes["train/0.ply"] = Mesh(far, np.delete(mesh.faces, lost, axis=0))
     with caplog.at_level(logging.WARNING):
-        data = serve(store, shapes=shapes)
+        data = prepared(cache, shapes=shapes)
     features = data.datasets["train"].items[0]["features"]
     assert torch.isfinite(features).all() and (features[0] == 0).all()
     assert caplog.text.count("SHOT is undefined at 1 of 162 vertices; using zeros") == 1
     assert "train/0.ply" in caplog.text
 
 
-def test_a_mesh_without_area_is_one_message(store):
+def test_a_mesh_without_area_is_rejected(cache):
     shapes = toy_shapes()
     mesh = shapes["val/0.ply"]
     shapes["val/0.ply"] = Mesh(np.zeros_like(mesh.vertices), mesh.faces)
     with pytest.raises(MeshError, match=r"val/0\.ply: surface area must be above 0"):
-        serve(store, shapes=shapes)
+        prepared(cache, shapes=shapes)
 
 
-def test_a_split_without_meshes_is_one_message(store):
+def test_a_split_without_meshes_is_rejected(cache):
     shapes = {name: mesh for name, mesh in toy_shapes().items() if not name.startswith("val")}
     with pytest.raises(DataError, match="the split val must have at least 1 mesh, got 0"):
-        serve(store, shapes=shapes)
+        prepared(cache, shapes=shapes)
 
 
-def test_a_mesh_far_from_the_origin_has_the_same_descriptors(store):
+def test_a_mesh_far_from_the_origin_has_the_same_descriptors(cache):
     mesh = bumpy_sphere()
     near = preprocessing._descriptors(mesh, 0.3, 4)["features"]
     far = preprocessing._descriptors(Mesh(mesh.vertices + 1e4, mesh.faces), 0.3, 4)["features"]
     assert (np.abs(far - near).max(axis=1) < 1e-3).mean() > 0.98
 
 
-def test_a_mesh_far_from_the_origin_has_the_same_metric_information(store):
+def test_a_mesh_far_from_the_origin_has_the_same_metric_information(cache):
     near = toy_shapes()
     far = {name: Mesh(mesh.vertices + 4e6, mesh.faces) for name, mesh in near.items()}
-    one, two = (serve(store, shapes=shapes).datasets["val"].items[0] for shapes in (near, far))
+    one, two = (prepared(cache, shapes=shapes).datasets["val"].items[0] for shapes in (near, far))
     spirals = one["sequences"][one["first"][:-1]].long()
     one, two = (metric_features(item["vertices"], spirals, item["unit"]) for item in (one, two))
     torch.testing.assert_close(one, two, rtol=0, atol=1e-5)
 
 
-def test_a_killed_process_of_the_pool_is_one_message():
+def test_a_killed_process_of_the_pool_raises_a_data_error():
     with pytest.raises(DataError, match=r"killed, .* data\.workers=1 needs less memory"):
         list(run_in_pool(os._exit, [(1,), (1,)], 2, "data.workers=1"))
 
 
-def test_labels_outside_the_template_are_refused():
+def test_labels_outside_the_template_are_rejected():
     mesh = lattice(3, 3)
     with pytest.raises(DataError, match=r"1 labels outside 0\.\.8.*vertex 4 has 9"):
         Shape(mesh, [0, 1, 2, 3, 9, 5, 6, 7, 8], 9)

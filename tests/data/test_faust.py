@@ -1,4 +1,4 @@
-"""FAUST and its remeshed benchmark, on files with their layout and size made from the bodies."""
+"""FAUST and its remeshed benchmark, with files of the same layout and size made from bodies."""
 
 import inspect
 import random
@@ -45,7 +45,7 @@ def files() -> dict[str, bytes]:
 
 @pytest.fixture(scope="module")
 def extracted(files, tmp_path_factory) -> Path:
-    """The folder MPI-FAUST, with registrations and with scans, which must not be read."""
+    """The folder MPI-FAUST, with registrations, and with scans that must not be read."""
     root = tmp_path_factory.mktemp("extracted") / "MPI-FAUST"
     for folder in ["training/registrations", "training/scans", "test/scans"]:
         (root / folder).mkdir(parents=True)
@@ -118,7 +118,7 @@ def test_of_two_copies_the_complete_one_is_read(extracted, tmp_path):
     assert len(Faust(tmp_path).load("tr_reg_001").mesh.vertices) == 6890
 
 
-def test_of_two_complete_copies_the_first_by_name_is_read_whatever_the_order(tmp_path):
+def test_of_two_complete_copies_the_first_by_name_is_read(tmp_path):
     corners = np.vstack([np.zeros(3), np.eye(3)])
     sides = np.array([[0, 2, 1], [0, 1, 3], [1, 2, 3], [0, 3, 2]])
     copies = {"a/": ply(Mesh(corners, sides)), "b/": ply(Mesh(2 * corners, sides))}
@@ -131,7 +131,7 @@ def test_of_two_complete_copies_the_first_by_name_is_read_whatever_the_order(tmp
 
 
 def assert_helps(message: str) -> None:
-    """The message is one paragraph: what is missing, where to get it, and what to use instead."""
+    """Check for one paragraph: what is missing, where to get it, and what to use instead."""
     assert "\n" not in message
     for part in ["FAUST (", *SITES, "data.root=/path/to/MPI-FAUST", ".zip", "data=bodies_6890"]:
         assert part in message
@@ -153,8 +153,10 @@ def test_a_missing_root_is_named(tmp_path):
 @pytest.mark.parametrize("kind", ["text", "cut short", "empty"])
 def test_a_file_that_is_not_an_intact_zip_is_rejected(kind, zips, tmp_path):
     path = tmp_path / "MPI-FAUST.zip"
-    whole = zips["zip"].read_bytes()
-    path.write_bytes({"text": b"a page", "cut short": whole[: len(whole) // 2], "empty": b""}[kind])
+    intact = zips["zip"].read_bytes()
+    path.write_bytes(
+        {"text": b"a page", "cut short": intact[: len(intact) // 2], "empty": b""}[kind]
+    )
     with pytest.raises(DataError, match=f"{path} is neither a folder nor an intact zip") as error:
         Faust(path)
     assert_helps(str(error.value))
@@ -164,8 +166,8 @@ def test_a_damaged_member_is_named(zips, tmp_path):
     path = tmp_path / "MPI-FAUST.zip"
     member = f"MPI-FAUST/{REGISTRATIONS}/tr_reg_005.ply"
     data = bytearray(zips["zip"].read_bytes())
-    with zipfile.ZipFile(zips["zip"]) as whole:
-        start = whole.getinfo(member).header_offset + 2000
+    with zipfile.ZipFile(zips["zip"]) as intact:
+        start = intact.getinfo(member).header_offset + 2000
     data[start : start + 500] = bytes(500)
     path.write_bytes(data)
     faust = Faust(path)
@@ -190,7 +192,7 @@ def test_an_incomplete_set_says_how_many_are_missing_and_the_first(kind, tmp_pat
     assert_helps(str(error.value))
 
 
-def test_a_folder_or_zip_of_something_else_lacks_all(tmp_path):
+def test_a_folder_or_zip_without_registrations_lacks_all(tmp_path):
     with pytest.raises(DataError, match="lacks 100 of the 100"):
         Faust(tmp_path)
     with zipfile.ZipFile(tmp_path / "other.zip", "w") as other:
@@ -203,9 +205,9 @@ def test_a_registration_with_another_number_of_vertices_is_rejected(extracted, t
     (tmp_path / REGISTRATIONS).mkdir(parents=True)
     for file in (extracted / REGISTRATIONS).iterdir():
         (tmp_path / REGISTRATIONS / file.name).symlink_to(file)
-    odd = tmp_path / REGISTRATIONS / "tr_reg_003.ply"
-    odd.unlink()
-    odd.write_bytes(ply(Bodies(1500).template))
+    wrong = tmp_path / REGISTRATIONS / "tr_reg_003.ply"
+    wrong.unlink()
+    wrong.write_bytes(ply(Bodies(1500).template))
     faust = Faust(tmp_path)
     with pytest.raises(DataError, match=r"tr_reg_003\.ply: 1500 vertices.*6890"):
         faust.load("tr_reg_003")
@@ -221,13 +223,13 @@ def test_an_unknown_registration_is_rejected(extracted):
 
 @cache
 def remeshed(number: int) -> tuple[Mesh, np.ndarray]:
-    """A substitute for a remeshed shape: not the template's counts, and repeated labels."""
+    """A substitute for a remeshed shape: another number of vertices, and repeated labels."""
     mesh = Bodies(1500).template
     labels = np.random.default_rng(number).integers(0, 6890, 1500)
     return Mesh(mesh.vertices + number, mesh.faces), labels
 
 
-def write(folder: Path, policy: str, numbers) -> None:
+def write_benchmark(folder: Path, policy: str, numbers) -> None:
     (folder / policy).mkdir(parents=True, exist_ok=True)
     for number in numbers:
         mesh, labels = remeshed(number)
@@ -239,7 +241,7 @@ def write(folder: Path, policy: str, numbers) -> None:
 @pytest.fixture(scope="module")
 def benchmark_files(tmp_path_factory) -> Path:
     root = tmp_path_factory.mktemp("benchmark")
-    write(root / "data", "qes", range(80, 100))
+    write_benchmark(root / "data", "qes", range(80, 100))
     return root
 
 
@@ -269,7 +271,7 @@ def test_benchmark_trains_on_registrations_and_tests_on_remeshed_shapes(
 
 def test_benchmark_can_train_on_its_own_meshes_of_training_subjects(extracted, benchmark_root):
     data = benchmark_root / "data"
-    write(data, "iso", [0, 3, 12])
+    write_benchmark(data, "iso", [0, 3, 12])
     train = ["iso/tr_reg_iso_01*.ply", "iso/*.ply"]
     benchmark = FaustBenchmark(extracted, data, policy="qes", train=train)
     assert benchmark.names["train"] == ["tr_reg_iso_012", "tr_reg_iso_000", "tr_reg_iso_003"]
@@ -277,8 +279,8 @@ def test_benchmark_can_train_on_its_own_meshes_of_training_subjects(extracted, b
     assert len(benchmark.names["test"]) == 20
 
 
-def test_training_subjects_are_left_out_of_the_test(extracted, benchmark_root, caplog):
-    write(benchmark_root / "data", "iso", [80, 85])
+def test_training_subjects_are_left_out_of_the_test_set(extracted, benchmark_root, caplog):
+    write_benchmark(benchmark_root / "data", "iso", [80, 85])
     train = ["iso/tr_reg_iso_08*.ply"]
     benchmark = FaustBenchmark(extracted, benchmark_root, policy="qes", train=train)
     assert benchmark.names["train"] == ["tr_reg_iso_080", "tr_reg_iso_085"]
@@ -294,7 +296,7 @@ def test_benchmark_rejects_training_on_all_test_subjects(extracted, benchmark_ro
 
 def test_benchmark_rejects_training_meshes_of_equal_or_invalid_names(extracted, benchmark_root):
     data = benchmark_root / "data"
-    write(data, "iso", [1])
+    write_benchmark(data, "iso", [1])
     (data / "copy").mkdir()
     (data / "copy" / "tr_reg_iso_001.ply").touch()
     with pytest.raises(DataError, match="have the same name"):
@@ -305,12 +307,14 @@ def test_benchmark_rejects_training_meshes_of_equal_or_invalid_names(extracted, 
 
 
 @pytest.mark.parametrize("policy", ["cloud", None])
-def test_another_policy_is_rejected_and_the_known_ones_named(extracted, benchmark_root, policy):
+def test_an_unknown_policy_is_rejected_and_the_known_ones_are_named(
+    extracted, benchmark_root, policy
+):
     with pytest.raises(DataError, match=f"iso, qes, mc, dense, got {policy!r}"):
         FaustBenchmark(extracted, benchmark_root, policy=policy)
 
 
-def test_benchmark_says_where_it_comes_from_when_missing(extracted, benchmark_root, tmp_path):
+def test_a_missing_benchmark_gives_an_error_with_its_url(extracted, benchmark_root, tmp_path):
     url = "github.com/nmwsharp/discretization-robust-correspondence-benchmark"
     with pytest.raises(DataError, match=f"benchmark_root is not set.*{url}"):
         FaustBenchmark(extracted, None)

@@ -45,7 +45,7 @@ def test_meshes_come_with_the_labels_of_their_files(root):
     assert shape.template_size == 5
 
 
-def test_matches_are_sorted_within_a_pattern_and_never_repeated(root):
+def test_files_are_sorted_within_a_pattern_and_never_repeated(root):
     assert folder(root, train=["a/*.off"]).names["train"] == ["a_0", "a_1", "a_2", "a_3"]
     data = folder(root, train=["b/*", "a/3.off", "a/*.off", "*/[02].off"])
     assert data.names["train"] == ["b_0", "a_3", "a_0", "a_1", "a_2"]
@@ -62,7 +62,7 @@ def test_a_split_can_be_listed_in_a_text_file(root, tmp_path):
         folder(root, val="val.txt")
 
 
-def test_an_existing_file_name_with_brackets_is_no_pattern(root):
+def test_an_existing_file_name_with_brackets_is_not_a_pattern(root):
     (root / "[ab].off").write_text(PYRAMID)
     (root / "a.off").write_text(PYRAMID)
     assert folder(root, train=["[ab].off"], labels=None).names["train"] == ["[ab]"]
@@ -111,7 +111,7 @@ def test_an_invalid_label_array_is_rejected_by_name(root, array, message):
         folder(root, test=["a/0.off"], labels="{stem}.npy").load("a_0")
 
 
-def test_an_archive_of_arrays_is_rejected(root):
+def test_an_npz_archive_named_npy_is_rejected(root):
     with (root / "a" / "0.npy").open("wb") as file:
         np.savez(file, labels=np.arange(4))
     with pytest.raises(DataError, match=r"a/0\.npy: labels must be integers"):
@@ -186,7 +186,7 @@ def test_links_and_labels_outside_the_folder_are_rejected(root):
             folder(root, train=["a/0.off"], labels=labels)
 
 
-def test_an_incomplete_or_wrong_description_is_rejected(root):
+def test_missing_or_invalid_arguments_are_rejected(root):
     for arguments in [(None, "template.off"), (root, None)]:
         with pytest.raises(DataError, match=r"needs data\.root=.* and data\.template="):
             Folder(*arguments, **NONE)

@@ -1,4 +1,4 @@
-"""The command line as a user types it: what works word for word, and one line for a mistake."""
+"""The command line: documented commands, help, sweeps, and one-line errors."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from meshspiral.experiment.sweeps import invocation, job_folder
 from tests.helpers import QUICK, ROOT, composed
 
 
-def test_the_documented_line_works_word_for_word(cli, toy_overrides, tmp_path):
+def test_the_documented_command_works(cli, toy_overrides, tmp_path):
     toy = [o for o in toy_overrides if not o.startswith("seq_len")]
     code, out, err = cli("model=fcs", "seq_len=20", "+metric=true", *toy, *QUICK)
     assert code == 0, err
@@ -44,7 +44,7 @@ def test_the_documented_line_works_word_for_word(cli, toy_overrides, tmp_path):
 
 
 def test_the_documented_sweep_works(cli, toy_overrides, tmp_path, monkeypatch):
-    """Which runs it has; other tests check what a run does."""
+    """Checks its jobs; `train` is replaced."""
     metrics = {"test/exact_match": 0.0, "test/geodesic_error": 0.0}
     monkeypatch.setattr(
         "meshspiral.training.run.train", lambda config, folder: write_metrics(folder, metrics)
@@ -55,26 +55,25 @@ def test_the_documented_sweep_works(cli, toy_overrides, tmp_path, monkeypatch):
     assert code == 0, err
     runs = [path.parent for path in (tmp_path / "sweep").glob("*/metrics.json")]
     assert len(runs) == 8
-    kinds = set()
+    settings = set()
     for folder in runs:
         config = OmegaConf.load(folder / "config.yaml")
-        kinds.add((config.model.name, config.seq_len, config.model.metric))
-        differs = f"model-{config.model.name}_seq_len-{config.seq_len}_metric-"
-        assert folder.name == differs + str(config.model.metric).lower()
-    assert len(kinds) == 8
+        settings.add((config.model.name, config.seq_len, config.model.metric))
+        prefix = f"model-{config.model.name}_seq_len-{config.seq_len}_metric-"
+        assert folder.name == prefix + str(config.model.metric).lower()
+    assert len(settings) == 8
 
 
-def test_all_three_networks_in_one_sweep(cli, toy_overrides, tmp_path):
+def test_one_sweep_trains_all_three_networks(cli, toy_overrides, tmp_path):
     code, _, err = cli("-m", "model=lstm,fcs,gcnn3", *toy_overrides, *QUICK, "hydra.sweep.dir=s")
     assert code == 0, err
-    kept = {
+    metrics = {
         path.parent.name: json.loads(path.read_text())
         for path in (tmp_path / "s").glob("*/metrics.json")
     }
-    assert sorted(kept) == ["model-fcs", "model-gcnn3", "model-lstm"]
-    assert (
-        len({tuple(sorted(metrics)) for metrics in kept.values()}) == 1
-    )  # the same figures of all
+    assert sorted(metrics) == ["model-fcs", "model-gcnn3", "model-lstm"]
+    names = {tuple(sorted(values)) for values in metrics.values()}
+    assert len(names) == 1  # all have the same metrics
 
 
 @pytest.mark.parametrize(
@@ -88,11 +87,11 @@ def test_all_three_networks_in_one_sweep(cli, toy_overrides, tmp_path):
         (None, False),
     ],
 )
-def test_every_way_of_giving_metric(override, expected):
+def test_every_way_to_set_metric(override, expected):
     assert composed([override] if override else []).model.metric is expected
 
 
-def test_the_root_metric_wins_over_what_an_experiment_sets_of_the_model():
+def test_the_root_setting_metric_overrides_model_metric():
     assert composed(["model.metric=true", "+metric=false"]).model.metric is False
     assert composed(["model.metric=false", "+metric=true"]).model.metric is True
 
@@ -168,7 +167,7 @@ def test_the_root_metric_wins_over_what_an_experiment_sets_of_the_model():
     ],
     ids=lambda value: " ".join(value) if isinstance(value, list) else "",
 )
-def test_a_mistake_is_one_clear_line(cli, arguments, message):
+def test_a_mistake_gives_a_one_line_error(cli, arguments, message):
     code, out, err = cli(*arguments)
     assert code in (1, 2)
     last = (out + err).strip().splitlines()[-1]
@@ -181,14 +180,14 @@ def test_a_mistake_is_one_clear_line(cli, arguments, message):
     ["trainer.accelerator=abacus", "trainer.devices=none", "trainer.strategy=luck"]
     + ["trainer=gpu"] * (not torch.cuda.is_available()),
 )
-def test_a_device_that_is_not_there_is_one_clear_line(cli, toy_overrides, override):
+def test_an_unavailable_device_gives_a_one_line_error(cli, toy_overrides, override):
     code, out, err = cli(*toy_overrides, override)
     last = (out + err).strip().splitlines()[-1]
     assert code == 1 and last.startswith("error: trainer: accelerator")
     assert "Traceback" not in out + err
 
 
-def test_help_shows_groups_settings_and_three_commands(cli):
+def test_help_shows_groups_settings_and_three_examples(cli):
     code, out, _ = cli("--help")
     assert code == 0
     lines = [" ".join(line.split()) for line in out.splitlines()]
@@ -245,9 +244,7 @@ def test_the_documented_commands_compose():
             composed(single)
 
 
-def test_a_failing_job_of_a_sweep_says_why_in_its_log_and_the_others_run(
-    cli, toy_overrides, tmp_path
-):
+def test_a_failed_job_logs_its_error_and_the_others_run(cli, toy_overrides, tmp_path):
     code, out, err = cli("-m", "optim.lr=0,0.01", *toy_overrides, *QUICK, "hydra.sweep.dir=sweep")
     assert code == 1
     failed, done = (tmp_path / "sweep" / f"optim.lr-{lr}" for lr in ("0", "0.01"))
@@ -257,7 +254,7 @@ def test_a_failing_job_of_a_sweep_says_why_in_its_log_and_the_others_run(
 
 
 def test_jobs_never_share_a_folder():
-    """Also where a name had to lose what tells two of them apart."""
+    """Also where characters are replaced or names are shortened."""
     values = ["[train/*.ply]", "[train/?.ply]", "/a/b", "a/b", "x" * 300, "x" * 301, "1", "2"]
     with invocation(["-m", "seq_len=8", "data.root=1,2"]):
         names = [job_folder(["seq_len=8", f"data.root={value}"], 0) for value in values]
@@ -268,14 +265,14 @@ def test_jobs_never_share_a_folder():
     assert job_folder([], 3) == "3"
 
 
-def test_a_folder_with_another_run_is_left_alone(cli, toy_overrides, tmp_path):
+def test_a_folder_with_another_run_is_not_overwritten(cli, toy_overrides, tmp_path):
     folder = [*toy_overrides, "hydra.run.dir=run"]
     assert cli(*folder, *QUICK)[0] == 0
     before = (tmp_path / "run" / "config.yaml").read_text()
     code, out, err = cli(*folder, *QUICK, "seed=7")
     assert code == 1 and "run holds another run, whose seed differ" in out + err
     assert (tmp_path / "run" / "config.yaml").read_text() == before
-    assert cli(*folder, *QUICK)[0] == 0  # the same run again: nothing left to do
+    assert cli(*folder, *QUICK)[0] == 0  # the same run: already finished
 
 
 def test_config_errors_name_the_key():

@@ -1,4 +1,4 @@
-"""Sweeps: killed and started again with the same command, they do only what is left."""
+"""Sweeps: resuming with the same command, folders, processes, launchers, experiments."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ from tests.helpers import QUICK, ROOT, composed, program_process, run, wait_for,
 SWEEP = ["-m", "seed=0,1,2", "optim.epochs=12"]
 
 
-def test_a_killed_sweep_does_what_is_left(cli, toy_overrides, tmp_path):
+def test_a_killed_sweep_resumes_with_the_unfinished_jobs(cli, toy_overrides, tmp_path):
     toy = [o for o in toy_overrides if not o.startswith("optim")]
     command = [*SWEEP, *toy]
     env = {**os.environ, "PYTHONPATH": str(ROOT)}
@@ -81,13 +81,13 @@ def test_a_killed_sweep_does_what_is_left(cli, toy_overrides, tmp_path):
     assert [job for job, *_ in job_states(sweep)] == ["seed-0", "seed-1", "seed-2", "seed-3"]
     assert (sweep / "seed-0" / METRICS).stat().st_mtime_ns == first
 
-    whole = tmp_path / "whole"
-    run(whole, [*toy, "optim.epochs=12", "seed=1"])
-    kept, expected = weights(sweep / "seed-1"), weights(whole)
-    assert all((kept[key] == expected[key]).all() for key in expected)
+    uninterrupted = tmp_path / "uninterrupted"
+    run(uninterrupted, [*toy, "optim.epochs=12", "seed=1"])
+    resumed, expected = weights(sweep / "seed-1"), weights(uninterrupted)
+    assert all((resumed[key] == expected[key]).all() for key in expected)
 
 
-def test_what_failed_is_in_the_table_and_tried_again(cli, toy_overrides, monkeypatch):
+def test_a_failed_job_is_listed_and_retried(cli, toy_overrides, monkeypatch):
     command = ["-m", "data.shot.bins=4,5", *toy_overrides, *QUICK]
     command = [word for word in command if word != "data.shot.bins=4"]
     from meshspiral.data import preprocessing
@@ -116,7 +116,7 @@ def test_what_failed_is_in_the_table_and_tried_again(cli, toy_overrides, monkeyp
     assert [state for _, state, _ in job_states(sweep)] == 2 * ["finished"]
 
 
-def test_runs_of_one_second_get_folders_of_their_own(tmp_path):
+def test_runs_started_in_the_same_second_get_different_folders(tmp_path):
     new = str(tmp_path / "12-00-00_fcs")
     with invocation([]):
         first = run_folder(None, new)
@@ -126,7 +126,7 @@ def test_runs_of_one_second_get_folders_of_their_own(tmp_path):
         assert run_folder(first, new) == first
 
 
-def test_one_command_one_folder():
+def test_the_same_command_gives_the_same_sweep_folder():
     def folder(*words):
         with invocation(list(words)):
             return sweep_folder()
@@ -139,8 +139,8 @@ def test_one_command_one_folder():
 
 
 @pytest.mark.parametrize("launcher", ["joblib", "submitit_local"])
-def test_jobs_run_in_processes_of_their_own(toy_overrides, tmp_path, launcher):
-    """Several at a time, with one cache, each on its share of the cores; one fails."""
+def test_launchers_run_jobs_in_separate_processes(toy_overrides, tmp_path, launcher):
+    """Two jobs share the cache and the cores; one fails."""
     toy = [o for o in toy_overrides if not o.startswith(("trainer.threads", "optim"))]
     command = ["-m", f"hydra/launcher={launcher}", "optim.lr=0,0.01", *toy, *QUICK]
     env = {k: v for k, v in os.environ.items() if not k.endswith("_NUM_THREADS")}
@@ -153,7 +153,7 @@ def test_jobs_run_in_processes_of_their_own(toy_overrides, tmp_path, launcher):
     )
     assert done.returncode == 1, done.stderr
     [sweep] = (tmp_path / "outputs" / "sweeps").iterdir()
-    if launcher == "joblib":  # as many jobs as cores at once
+    if launcher == "joblib":  # one core per job
         log = (sweep / "optim.lr-0.01" / "train.log").read_text()
         assert "32-true on cpu, 1 thread\n" in log
     assert "launcher" not in sweep.name
@@ -165,15 +165,17 @@ def test_jobs_run_in_processes_of_their_own(toy_overrides, tmp_path, launcher):
     assert "optim.lr must be above 0" in done.stdout
     alone = tmp_path / "alone"
     run(alone, [*toy, *QUICK, "optim.lr=0.01", "trainer.threads=1"])
-    kept, expected = weights(sweep / "optim.lr-0.01"), weights(alone)
+    trained, expected = weights(sweep / "optim.lr-0.01"), weights(alone)
     for key, value in expected.items():
-        np.testing.assert_allclose(kept[key], value, atol=1e-4)
+        np.testing.assert_allclose(trained[key], value, atol=1e-4)
 
 
-def test_two_processes_measure_what_one_does(toy_overrides, tmp_path):
-    """Three meshes on two processes: every mesh counts once. As a job of a sweep, of which the
-    second process must know nothing; and which a cluster runs as one task, having begun as a run in
-    one process."""
+def test_two_processes_give_the_metrics_of_one(toy_overrides, tmp_path):
+    """Three meshes on two processes: every mesh counts once.
+
+    The run starts in one process. It resumes as a job of a sweep, in one task of a cluster; the
+    second process must not start the sweep again.
+    """
     ddp = ["trainer=ddp", "trainer.accelerator=cpu", "trainer.devices=2"]
     (tmp_path / "job").mkdir()
     claim(tmp_path / "job", composed([*toy_overrides, "optim.epochs=2"]))
@@ -223,17 +225,17 @@ def test_a_signal_to_one_process_of_several_stops_all(toy_overrides, tmp_path):
     process = program_process([*toy_overrides, *ddp, "optim.epochs=500"], tmp_path)
     wait_for((tmp_path / LAST).exists, process)
     process.send_signal(signal.SIGTERM)
-    output, _ = process.communicate(timeout=60)  # of all of them: they share the pipe
+    output, _ = process.communicate(timeout=60)  # of all processes: they share the pipe
     assert process.returncode == 143 and "Traceback" not in output, output
     assert output.count(f"To resume: python -m src.train resume={tmp_path}") == 1
     torch.load(tmp_path / LAST, weights_only=True)
 
 
-def test_a_signal_while_the_processes_agree_waits_for_the_next_step(tmp_path):
+def test_a_signal_during_the_all_reduce_stops_at_the_next_step(tmp_path):
     stop = OrderlyStop(tmp_path)
 
     def agree(decision, all):
-        stop.signum = signal.SIGINT  # comes when the others have been told that there is none
+        stop.signum = signal.SIGINT  # comes after this process reported no signal
         return decision
 
     strategy = SimpleNamespace(reduce_boolean_decision=agree)
@@ -246,7 +248,7 @@ def test_a_signal_while_the_processes_agree_waits_for_the_next_step(tmp_path):
     assert stopped.value.signum == signal.SIGINT
 
 
-def test_a_job_at_which_another_process_is_is_left_to_it(cli, toy_overrides, tmp_path):
+def test_a_job_of_another_process_is_skipped(cli, toy_overrides, tmp_path):
     command = ["-m", "seed=0,1", *toy_overrides, *QUICK]
     sweep = tmp_path / "sweep"
     (sweep / "seed-0").mkdir(parents=True)
@@ -262,15 +264,15 @@ def test_a_job_at_which_another_process_is_is_left_to_it(cli, toy_overrides, tmp
     assert [state for _, state, _ in job_states(sweep)] == 2 * ["finished"]
 
 
-def test_a_job_of_several_processes_at_which_others_are_has_not_failed(tmp_path, monkeypatch):
-    monkeypatch.setattr(sys, "executable", "false")  # what it runs ends with 1
+def test_a_multi_process_job_that_is_already_running_has_not_failed(tmp_path, monkeypatch):
+    monkeypatch.setattr(sys, "executable", "false")  # a command that exits with 1
     with alone(tmp_path), pytest.raises(InUse):
         train_separately(tmp_path, [])
     with pytest.raises(RunError, match=r"exit code 1; the reason is in .*train\*\.log"):
         train_separately(tmp_path, [])
 
 
-def test_a_run_with_other_settings_fails_but_what_is_finished_stays_so(cli, toy_overrides):
+def test_other_settings_fail_but_finished_jobs_stay_finished(cli, toy_overrides):
     command = ["-m", "seed=0,1", *toy_overrides, "hydra.sweep.dir=sweep"]
     assert cli(*command, *QUICK)[0] == 0
     code, _, _ = cli(*command, "optim.epochs=2")
@@ -308,37 +310,37 @@ def two_at_a_time(toy_overrides, tmp_path):
     process.kill()
 
 
-@pytest.mark.skipif(not Path("/proc/self/task").is_dir(), reason="/proc names the workers")
-def test_a_worker_that_is_killed_leaves_the_table_and_a_line(two_at_a_time, tmp_path):
-    own = Path(f"/proc/{two_at_a_time.pid}/task/{two_at_a_time.pid}/children")
-    children = [Path("/proc", pid) for pid in own.read_text().split()]
+@pytest.mark.skipif(not Path("/proc/self/task").is_dir(), reason="finds the workers in /proc")
+def test_a_killed_worker_leaves_the_table_and_a_one_line_error(two_at_a_time, tmp_path):
+    pids = Path(f"/proc/{two_at_a_time.pid}/task/{two_at_a_time.pid}/children")
+    children = [Path("/proc", pid) for pid in pids.read_text().split()]
     worker = next(c for c in children if "popen_loky" in (c / "cmdline").read_text())
     os.kill(int(worker.name), signal.SIGKILL)
     out, err = two_at_a_time.communicate(timeout=60)
     assert two_at_a_time.returncode == 1
     assert out.count("the same command resumes it") == 2 and "Traceback" not in err
-    line = (
+    message = (
         r"error: a job crashed \(TerminatedWorkerError: .*; traceback in (.*)\); "
         r"rerun the same command to resume\n"
     )
-    [where] = re.findall(line, err)
-    assert "TerminatedWorkerError" in (tmp_path / where).read_text()
+    [traceback] = re.findall(message, err)
+    assert "TerminatedWorkerError" in (tmp_path / traceback).read_text()
 
 
-def test_ctrl_c_in_a_launcher_says_how_to_go_on(two_at_a_time):
+def test_ctrl_c_in_a_launcher_says_how_to_resume(two_at_a_time):
     two_at_a_time.send_signal(signal.SIGINT)
     _, err = two_at_a_time.communicate(timeout=60)
     assert two_at_a_time.returncode == 130
     assert "Stopped. To resume: rerun the same command" in err
 
 
-def test_a_run_whose_pictures_failed_is_not_finished(cli, toy_overrides, monkeypatch):
-    def full(*_):
+def test_a_run_whose_plots_failed_is_not_finished(cli, toy_overrides, monkeypatch):
+    def disk_full(*_):
         raise OSError(28, "No space left on device", "curve.png")
 
     command = ["-m", "seed=0", *toy_overrides, *QUICK]
     with monkeypatch.context() as broken:
-        broken.setattr("meshspiral.evaluation.summary.write_plots", full)
+        broken.setattr("meshspiral.evaluation.summary.write_plots", disk_full)
         assert cli(*command)[0] == 1
     [sweep] = Path("outputs/sweeps").iterdir()
     [row] = job_states(sweep)
@@ -397,11 +399,13 @@ def test_the_launchers_have_configs(cli, launcher):
     ],
 )
 @pytest.mark.parametrize("paper", [False, True])
-def test_the_paper_s_experiments_are_sweeps(cli, toy_overrides, monkeypatch, name, jobs, paper):
-    """Which jobs they are, with our settings or the paper's; what they do has its own tests."""
-    figures = {"test/exact_match": 0.0, "test/geodesic_error": 0.0}
+def test_the_experiments_of_the_paper_are_sweeps(
+    cli, toy_overrides, monkeypatch, name, jobs, paper
+):
+    """Checks their jobs, with our settings and the paper's; `train` is replaced."""
+    metrics = {"test/exact_match": 0.0, "test/geodesic_error": 0.0}
     monkeypatch.setattr(
-        "meshspiral.training.run.train", lambda config, folder: write_metrics(folder, figures)
+        "meshspiral.training.run.train", lambda config, folder: write_metrics(folder, metrics)
     )
     toy = [o for o in toy_overrides if not o.startswith(("seq_len", "data.shot"))]
     name, *words = name.split()

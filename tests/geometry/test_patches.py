@@ -190,7 +190,7 @@ def test_on_an_irregular_flat_mesh_the_samples_are_a_polar_grid(radius):
 
 
 @pytest.mark.parametrize("rays", [1, 2, 3, 6])
-def test_a_ray_through_vertices_or_along_edges_goes_straight_on(rays):
+def test_a_ray_through_vertices_or_along_edges_stays_straight(rays):
     flat = mesh = lattice(15, 15)
     for v in [15 * i + j for i in (4, 6, 8, 10) for j in (3, 6, 9)]:
         mesh = split_vertex(mesh, v, v % 3, v % 3 + 3)  # two vertices at one point
@@ -320,33 +320,33 @@ def half_edges(mesh: Mesh) -> dict:
 
 
 def walk(mesh: Mesh, halves: dict, v: int, x: int, angle: float, distances) -> tuple:
-    """Walk straight on from v in space, at `angle` to the edge to x.
+    """Walk straight from v in space, at `angle` to the edge to x.
 
     At every edge the direction is rotated about the edge into the next face.
 
     Returns:
-        The points at the distances, NaN behind the boundary; and the smallest distance of the walk
+        The points at the distances, NaN beyond the boundary; and the smallest distance of the walk
         from a vertex.
     """
     points, done = np.full((len(distances), 3), np.nan), 0
     third, along, outward = halves[v, x]
     direction = np.cos(angle) * along - np.sin(angle) * outward
-    here, walked, closest, ahead = mesh.vertices[v], 0.0, np.inf, [(x, third)]
+    position, walked, closest, ahead = mesh.vertices[v], 0.0, np.inf, [(x, third)]
     while True:
         exits = []
         for edge in ahead:
             speed = direction @ halves[edge][2]
             if speed > 0:
-                way = (mesh.vertices[edge[0]] - here) @ halves[edge][2]
-                exits.append((way / speed, edge))
+                away = (mesh.vertices[edge[0]] - position) @ halves[edge][2]
+                exits.append((away / speed, edge))
         step, (a, b) = min(exits)
         while done < len(distances) and distances[done] <= walked + step:
-            points[done] = here + (distances[done] - walked) * direction
+            points[done] = position + (distances[done] - walked) * direction
             done += 1
-        here, walked = here + step * direction, walked + step
+        position, walked = position + step * direction, walked + step
         if done == len(distances):
             return points, closest
-        closest = min(closest, *np.linalg.norm(mesh.vertices[[a, b]] - here, axis=1))
+        closest = min(closest, *np.linalg.norm(mesh.vertices[[a, b]] - position, axis=1))
         if (b, a) not in halves:
             return points, closest
         _, along, outward = halves[a, b]
@@ -455,14 +455,14 @@ def rays_by_fan(mesh: Mesh, v: int, fans: list) -> tuple[list[int], list[float]]
     return [sum(row <= fan for row in used) for fan in fans], angles
 
 
-def test_the_angles_of_open_fans_that_meet_follow_one_another():
+def test_at_a_bow_tie_the_angles_of_the_fans_add_up():
     counts, angles = rays_by_fan(bow_tie(), 0, [{1, 2}, {3, 4}])
     assert sum(counts) == np.sum(sum(angles) > ANGLES + TURN / 32)
     assert all(abs(n - a * 16 / TURN) < 1 for n, a in zip(counts, angles, strict=True))
 
 
 @pytest.mark.parametrize("height", [0.3, 3.0])
-def test_closed_fans_that_meet_share_the_full_turn(height):
+def test_closed_fans_with_a_common_vertex_share_the_full_turn(height):
     cones = two_cones()
     mesh = Mesh(cones.vertices * [1, 1, height], cones.faces)
     counts, angles = rays_by_fan(mesh, 0, [set(range(1, 6)), set(range(6, 11))])
@@ -652,13 +652,13 @@ def test_finer_grids_contain_the_samples_of_coarser_ones(mesh):
 
 
 @pytest.mark.parametrize("radius", [0, -1, np.nan, np.inf])
-def test_a_wrong_radius_is_refused(radius):
+def test_an_invalid_radius_is_rejected(radius):
     with pytest.raises(ValueError, match=f"radius must be positive and finite, got {radius}"):
         geodesic_patches(lattice(3, 3), radius)
 
 
 @pytest.mark.parametrize("rings, rays", [(0, 16), (5, 0), (-1, 16), (5, -2)])
-def test_a_grid_without_samples_is_refused(rings, rays):
+def test_a_grid_without_samples_is_rejected(rings, rays):
     with pytest.raises(ValueError, match=f"at least 1, got {rings} and {rays}"):
         geodesic_patches(lattice(3, 3), 1.0, rings, rays)
 

@@ -92,8 +92,8 @@ def planar(mesh: Mesh, v: int):
     return np.hypot(x, y), angle - angle[zero_direction(mesh, v)]
 
 
-def apart(a, b):
-    """The largest angle between the directions a and b."""
+def largest_angle(a, b):
+    """The largest angle between the directions a and b, in radians."""
     return np.abs((a - b + np.pi) % (2 * np.pi) - np.pi).max()
 
 
@@ -136,7 +136,8 @@ def test_on_a_plane_distances_and_angles_are_exact(stretch, radius):
         np.testing.assert_array_equal(np.isfinite(distance), near)
         np.testing.assert_allclose(distance[near], expected[near], rtol=1e-8)
         near[v] = False
-        assert apart(angle[near], expected_angle[near]) < 1e-4  # the square root of the bound above
+        # the square root of the bound above
+        assert largest_angle(angle[near], expected_angle[near]) < 1e-4
 
 
 @pytest.mark.parametrize("heights", [[-0.8] * 5, [0.7, -0.7] * 3], ids=["cone", "saddle"])
@@ -156,12 +157,15 @@ def test_around_an_apex_angles_are_rescaled_to_a_full_turn(heights):
         to = np.arccos(np.clip(corners @ x, -1, 1))
         side = np.argmin(np.abs(to + np.roll(to, -1) - widths))  # the side that contains x
         expected = (begins[side] + to[side] - start) * 2 * np.pi / widths.sum()
-        assert apart(angle[u], expected) < 1e-6
+        assert largest_angle(angle[u], expected) < 1e-6
 
 
 def test_behind_a_corner_of_half_a_turn_angles_are_exact():
-    """Vertex 0 lies on the edge from 1 to 2 and is connected to it by a face of zero area. Rounding
-    makes its corner slightly more or less than half a turn, and the edge too short or too long."""
+    """Vertex 0 lies on the edge from 1 to 2; a face of zero area connects the three.
+
+    Rounding makes its corner slightly more or less than half a turn, and the edge slightly too
+    short or too long.
+    """
     rng = np.random.default_rng(0)
     faces = np.array([[0, 1, 2], [0, 3, 1], [0, 2, 3], [2, 1, 4], [2, 4, 5]])
     for first in range(100):
@@ -171,7 +175,7 @@ def test_behind_a_corner_of_half_a_turn_angles_are_exact():
         distance, angle = polar(mesh, 0, 9.0)
         expected, expected_angle = planar(mesh, 0)
         np.testing.assert_allclose(distance, expected, rtol=1e-7)  # the square root of rounding
-        assert apart(angle[1:], expected_angle[1:]) < 1e-6
+        assert largest_angle(angle[1:], expected_angle[1:]) < 1e-6
 
 
 def test_on_a_sphere_distances_are_great_circles():
@@ -257,7 +261,7 @@ def test_every_row_is_normalised(mesh, radius):
     assert_normalised(gaussian_windows(mesh, radius, 2, 3), mesh, 2, 3)
 
 
-def test_a_patch_of_one_vertex_is_that_vertex():
+def test_in_a_patch_of_one_vertex_that_vertex_has_weight_1():
     mesh = bumpy_sphere()
     table = gaussian_windows(mesh, 1e-3)
     np.testing.assert_array_equal(table.indices, np.repeat(np.arange(len(mesh.vertices)), 80))
@@ -265,7 +269,7 @@ def test_a_patch_of_one_vertex_is_that_vertex():
 
 
 def test_rows_are_normalised_where_all_rings_but_a_far_one_vanish():
-    """The last ring's exp(-10^4) underflows; a row of it alone would be 0 / 0."""
+    """The last ring's exp(-10^4) underflows; a row of only this ring would be 0 / 0."""
     mesh = bumpy_sphere()
     assert_normalised(gaussian_windows(mesh, 1e-3, rings=200, rays=2), mesh, 200, 2)
     assert_normalised(gaussian_windows(mesh, 0.5, rings=200, rays=2), mesh, 200, 2)
@@ -300,8 +304,8 @@ def test_on_damaged_meshes_every_row_is_normalised(mesh, how):
         assert_normalised(gaussian_windows(damaged, radius, 2, 5), damaged, 2, 5)
 
 
-def test_the_front_ends_where_needles_correct_one_another():
-    """Takes 0.5 s; forty times that if every correction were processed."""
+def test_propagation_ends_on_a_mesh_of_needles():
+    """Takes 0.5 s; processing every correction of a distance would take 20 s."""
     mesh = punctured(bumpy_sphere(3, 3), 0.4)
     mesh = Mesh(mesh.vertices * [1e5, 1, 1], mesh.faces)
     polar(mesh, 0, 1.0)  # compile
@@ -311,7 +315,7 @@ def test_the_front_ends_where_needles_correct_one_another():
     assert process_time() - start < 5
 
 
-def test_in_a_patch_without_area_all_vertices_count_alike():
+def test_in_a_patch_without_area_all_vertices_have_equal_weights():
     mesh = collapsed(bumpy_sphere(subdivisions=1), "to a point")
     rows = dense(gaussian_windows(mesh, 1.0), 42)
     # all vertices of the component are at distance 0
@@ -372,8 +376,8 @@ def test_renumbering_the_faces_only_turns_patches(mesh):
         near = np.isfinite(distance) & (np.arange(len(angle)) != v)
         if near.any():
             by = (angle_2 - angle)[near]
-            assert apart(by, by[0]) < 1e-6
-            turned += apart(by[0], 0) > 1e-3
+            assert largest_angle(by, by[0]) < 1e-6
+            turned += largest_angle(by[0], 0) > 1e-3
     assert turned > 10
 
 
@@ -410,7 +414,7 @@ def test_on_a_lattice_opposite_cells_are_opposite_and_outer_rings_farther_out():
         ((1.0, 3, 0), "rings and rays must be at least 1, got 3 and 0"),
     ],
 )
-def test_wrong_arguments_are_refused(arguments, message):
+def test_invalid_arguments_are_rejected(arguments, message):
     with pytest.raises(ValueError, match=message):
         gaussian_windows(torus(), *arguments)
 

@@ -48,7 +48,7 @@ def sweep(tmp_path_factory, toy_overrides):
 
 
 class Page(HTMLParser):
-    """The texts of the tables' rows, all tags' attributes, and the data."""
+    """A parsed page: the cells of its tables, the attributes of all tags, and the data."""
 
     def __init__(self, text):
         super().__init__()
@@ -112,8 +112,9 @@ def test_a_report_has_a_page_tables_and_plots(cli, sweep, tmp_path):
     folder = tmp_path / "report"
     text = (folder / "index.html").read_text()
     page = Page(text)
-    addresses = [v for _, a in page.attributes for k, v in a.items() if k in ("src", "href")]
-    assert [a for a in addresses if not a.startswith(("data:", "#"))] == []  # needs no network
+    links = [v for _, a in page.attributes for k, v in a.items() if k in ("src", "href")]
+    # the page loads nothing from the internet
+    assert [link for link in links if not link.startswith(("data:", "#"))] == []
     columns, _ = run_table(group_runs(read_runs(str(sweep))[0]))
     assert page.rows[0] == columns and len(page.rows) == 1 + 7 + 1 + 1  # one group has two seeds
     assert "±" in " ".join(page.rows[-1])
@@ -160,7 +161,7 @@ def test_the_shapes_of_the_page_are_those_of_the_data_set(cli, sweep, tmp_path):
     assert labels.tolist() == list(range(162))
 
 
-def test_remeshed_shapes_are_surfaces_of_their_own(cli, toy_overrides, tmp_path):
+def test_remeshed_shapes_have_their_own_surfaces(cli, toy_overrides, tmp_path):
     run(tmp_path / "run", [*toy_overrides, *REMESH, "optim.epochs=1"])
     code, out, err = cli("runs=run", "shapes=2", program=main)
     assert code == 0 and "cannot show" not in out, err
@@ -193,15 +194,15 @@ def test_unreadable_runs_are_listed_and_the_others_shown(cli, sweep, tmp_path):
     for name, reason in reasons.items():
         assert re.search(rf"copy/{name}\b.*{reason}", text)
         assert re.search(rf"omitted: copy/{name}\b.*{reason}", out)
-    code, out, _ = cli("runs=copy", "shapes=0", program=main)  # the report's folder is no run
+    code, out, _ = cli("runs=copy", "shapes=0", program=main)  # the report's folder is not a run
     assert code == 0 and "Runs:    3, 4 omitted" in out
 
 
 def test_without_the_data_set_only_the_shapes_are_missing(cli, toy, toy_overrides, tmp_path):
-    here = Path(shutil.copytree(toy, tmp_path / "here"))
-    overrides = [o.replace(str(toy), str(here)) for o in toy_overrides]
+    root = Path(shutil.copytree(toy, tmp_path / "here"))
+    overrides = [o.replace(str(toy), str(root)) for o in toy_overrides]
     run(tmp_path / "run", [*overrides, "optim.epochs=1"])
-    shutil.rmtree(here)
+    shutil.rmtree(root)
     code, out, err = cli("runs=run", program=main)
     assert code == 0, err
     page = (tmp_path / "run/report/index.html").read_text()
@@ -211,9 +212,9 @@ def test_without_the_data_set_only_the_shapes_are_missing(cli, toy, toy_override
 
 
 def test_shapes_of_a_data_set_that_changed_are_not_shown(cli, toy, toy_overrides, tmp_path):
-    here = Path(shutil.copytree(toy, tmp_path / "here"))
-    run(tmp_path / "run", [*(o.replace(str(toy), str(here)) for o in toy_overrides), *QUICK])
-    for path in here.rglob("*.ply"):
+    root = Path(shutil.copytree(toy, tmp_path / "here"))
+    run(tmp_path / "run", [*(o.replace(str(toy), str(root)) for o in toy_overrides), *QUICK])
+    for path in root.rglob("*.ply"):
         mesh = trimesh.load(path, process=False).subdivide()
         mesh.export(path)
     code, out, err = cli("runs=run", program=main)
@@ -224,11 +225,11 @@ def test_shapes_of_a_data_set_that_changed_are_not_shown(cli, toy, toy_overrides
 
 
 def test_only_seeds_are_pooled(sweep):
-    """Runs with other test shapes or precision are other groups; equal seeds count once."""
+    """Other test shapes or another precision make another group; equal seeds count once."""
     [one] = read_runs(str(sweep / "fcs5"))[0]
     other = replace(one, outcome=replace(one.outcome, labels=one.outcome.labels[::-1]))
-    exact = changed(one, trainer={"precision": "64"})
-    groups = group_runs([one, other, exact, one])
+    double = changed(one, trainer={"precision": "64"})
+    groups = group_runs([one, other, double, one])
     assert sorted(len(group.runs) for group in groups) == [1, 1, 2]
     assert all(group.seeds == {0} for group in groups)
     assert {group.label() for group in groups} == {
@@ -267,7 +268,7 @@ def test_seeds_that_shuffle_vertices_are_pooled(sweep):
 
 
 def test_settings_of_a_neighbourhood_appear_under_its_name(sweep):
-    """Whole rings of spirals are a length; the rings of a patch are a setting like others."""
+    """`rings` is a length for spirals, and an ordinary setting for patches."""
     runs = {run.folder.name: run for run in read_runs(str(sweep))[0]}
     spirals = [changed(runs["lstm5"], neighbourhood={"rings": rings}) for rings in (None, 1, 2)]
     patches = [changed(runs["gcnn3"], neighbourhood={"rings": rings}) for rings in (3, 4)]
@@ -290,14 +291,14 @@ def test_a_network_without_sequences_ignores_the_root_seq_len(sweep):
     assert group.length is None and group.metric is None and group.label() == "GCNN3, folder"
 
 
-def test_networks_with_one_title_are_told_apart(sweep, monkeypatch):
+def test_networks_with_the_same_title_get_different_names(sweep, monkeypatch):
     monkeypatch.setattr(Network, "registered", {**Network.registered, "wide": FCSNet})
     [one] = read_runs(str(sweep / "fcs5"))[0]
     groups = group_runs([one, changed(one, model={"name": "wide"})])
     assert [group.network for group in groups] == ["FCS-NET (fcs)", "FCS-NET (wide)"]
 
 
-def test_data_sets_of_one_name_are_told_apart_by_their_settings(sweep):
+def test_data_sets_with_the_same_name_are_distinguished_by_their_settings(sweep):
     [one] = read_runs(str(sweep / "fcs5"))[0]
     other = changed(one, data={"labels": "{stem}.txt"})
     described = changed(one, data={"shot": one.config.data.shot.model_copy(update={"bins": 5})})
@@ -318,10 +319,10 @@ def test_a_name_cannot_break_the_page(cli, sweep, tmp_path):
     page = Page(text)
     assert name in {scene["run"] for scene in json.loads(page.data)["scenes"]}
     assert f"odd/{name}" in {row[-1] for row in page.rows if row}
-    assert read_runs(str(tmp_path / "odd" / name))[0]  # a folder, though it has wildcards
+    assert read_runs(str(tmp_path / "odd" / name))[0]  # wildcards in a folder's name
 
 
-def test_file_names_of_plots_are_short_and_differ():
+def test_file_names_of_plots_are_short_and_unique():
     assert file_name("Lengths of FCS-NET++, a") != file_name("Lengths of FCS-NET, a")
     long = "x" * 300
     assert len(file_name(long)) < 120 and file_name(long) != file_name(long + "y")
@@ -336,7 +337,7 @@ def test_file_names_of_plots_are_short_and_differ():
         (["runs=.", "shapes=-1"], "shapes must be at least 0, got -1"),
     ],
 )
-def test_a_mistake_is_one_clear_line(cli, arguments, message):
+def test_a_mistake_gives_a_one_line_error(cli, arguments, message):
     code, out, err = cli(*arguments, program=main)
     assert code == 1
     assert message in (out + err).strip().splitlines()[-1]
