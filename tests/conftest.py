@@ -9,6 +9,7 @@ import signal
 import sys
 from pathlib import Path
 
+os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # waiting threads leave the cores to others
 os.environ.setdefault("OMP_NUM_THREADS", "1")  # read by torch; the tests run in parallel
 
 import numpy as np
@@ -46,6 +47,14 @@ def toy(tmp_path_factory) -> Path:
         path.parent.mkdir(exist_ok=True)
         trimesh.Trimesh(mesh.vertices, mesh.faces, process=False).export(path)
     return root
+
+
+# the files that take longest, which no process should begin last
+FIRST = ("test_sweeps.py", "test_train.py", "test_extending.py", "test_package.py", "test_docs.py")
+
+
+def pytest_collection_modifyitems(items):
+    items.sort(key=lambda item: item.path.name not in FIRST)
 
 
 @pytest.fixture

@@ -5,6 +5,8 @@ from __future__ import annotations
 import importlib
 import json
 import re
+import subprocess
+import sys
 
 import pytest
 import torch
@@ -18,9 +20,10 @@ from meshspiral.experiment.schema import (
     ConfigError,
     OptimSettings,
     TrainerSettings,
+    registered,
 )
 from meshspiral.experiment.sweeps import invocation, job_folder
-from tests.helpers import QUICK, ROOT, composed
+from tests.helpers import QUICK, ROOT, clone_environment, composed
 
 
 def test_the_documented_command_works(cli, toy_overrides, tmp_path):
@@ -219,9 +222,16 @@ def test_help_of_a_command_names_its_settings_and_no_internal_group(cli, command
     assert "cli" not in settings
 
 
+def test_the_command_line_is_read_without_torch():
+    """Help and most mistakes take a second, not five."""
+    script = "import sys, meshspiral.commands.match; sys.exit('torch' in sys.modules)"
+    done = subprocess.run([sys.executable, "-c", script], env=clone_environment(), check=False)
+    assert done.returncode == 0
+
+
 def test_every_setting_has_a_help_text():
     schemas = [*COMMANDS.values(), OptimSettings, TrainerSettings, ShotSettings, RemeshSettings]
-    schemas += [cls.Settings for base in GROUPS.values() for cls in base.registered.values()]
+    schemas += [cls.Settings for group in GROUPS for cls in registered(group).values()]
     for schema in schemas:
         for name, field in schema.model_fields.items():
             group = name in ("name", "model", "neighbourhood", "data", "shot", "trainer", "optim")

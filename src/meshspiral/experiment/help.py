@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from pathlib import Path
 
 from omegaconf import OmegaConf
 from pydantic import BaseModel
 
 from meshspiral.data.settings import DataSettings, RemeshSettings, ShotSettings
-from meshspiral.data.shapes import ShapeSet
 from meshspiral.experiment.program import command_line
 from meshspiral.experiment.schema import (
+    GROUPS,
     BenchmarkConfig,
     EvaluateConfig,
     MatchConfig,
@@ -19,9 +20,8 @@ from meshspiral.experiment.schema import (
     ReportConfig,
     TrainConfig,
     TrainerSettings,
+    registered,
 )
-from meshspiral.neighbourhoods import Neighbourhood
-from meshspiral.nn.networks import Network
 
 COMMANDS = {
     "train": TrainConfig,
@@ -66,12 +66,9 @@ def settings_help(command: str, conf: Path) -> str:
         }
         for prefix, schema in parts.items():
             lines += _settings(schema, prefix)
-        for group, base in (("model", Network), ("neighbourhood", Neighbourhood)):
-            lines += ["", f"Settings of all options of {group}:"]
-            lines += _settings(base.Settings, f"{group}.")
-            lines += _own_settings(group, base.registered, base.Settings)
-        lines += ["", "Settings of single options of data:"]
-        lines += _own_settings("data", ShapeSet.registered, DataSettings)
+        for group in GROUPS:
+            lines += ["", f"Settings of {group}, with the options that have them:"]
+            lines += _settings_of_options(group)
     lines += ["", "All settings with their values: add --cfg job", ""]
     return "\n".join(lines).replace("$", "$$")  # Hydra substitutes $NAME
 
@@ -88,21 +85,24 @@ def _groups(command: str, conf: Path) -> list[str]:
     return lines
 
 
-def _settings(schema: type[BaseModel], prefix: str = "", known: type | None = None) -> list[str]:
+def _settings(schema: type[BaseModel], prefix: str = "", skip: Iterable[str] = ()) -> list[str]:
     """A line for each setting that is not a group of settings."""
-    fields = schema.model_fields.items()
-    skip = set(known.model_fields) if known else set()
     return [
         f"  {prefix + name:<24} {field.description}"
-        for name, field in fields
+        for name, field in schema.model_fields.items()
         if field.description and name not in skip
     ]
 
 
-def _own_settings(group: str, registered: dict[str, type], common: type[BaseModel]) -> list[str]:
-    """The settings that single options add: one line each, with the options that have it."""
-    owners: dict[str, list[str]] = {}
-    for name, cls in registered.items():
-        for line in _settings(cls.Settings, f"{group}.", common):
-            owners.setdefault(line, []).append(name)
-    return [f"{line} ({', '.join(names)})" for line, names in owners.items()]
+def _settings_of_options(group: str) -> list[str]:
+    """The settings of all options of a group, each with the options that have it unless all do."""
+    classes = registered(group)
+    options: dict[str, list[str]] = {}
+    for name, cls in classes.items():
+        shared = DataSettings.model_fields if group == "data" else ()
+        for line in _settings(cls.Settings, f"{group}.", shared):
+            options.setdefault(line, []).append(name)
+    return [
+        line if len(names) == len(classes) else f"{line} ({', '.join(names)})"
+        for line, names in options.items()
+    ]

@@ -1,7 +1,8 @@
 """The settings of all commands: their types, ranges, choices and help texts.
 
 Default values stand in conf/, and nowhere else. A network, a neighbourhood and a data set declare
-their own settings, in their class's `Settings`.
+their own settings, in their class's `Settings`. These classes import torch, which takes seconds, so
+they are imported when a config that names them is read.
 """
 
 from __future__ import annotations
@@ -26,11 +27,7 @@ from pydantic import (
     model_validator,
 )
 
-import meshspiral.data.datasets  # noqa: F401  registers the data sets
 from meshspiral.data.settings import DataSettings, Text
-from meshspiral.data.shapes import ShapeSet
-from meshspiral.neighbourhoods import Neighbourhood
-from meshspiral.nn.networks import Network
 
 
 class ConfigError(ValueError):
@@ -99,8 +96,8 @@ class TrainConfig(Settings):
     seed: int = Field(ge=0, lt=2**32, description="seed of weights, order, spirals and dropout")
     resume: Text | None = Field(description="folder of a stopped run to resume")
     plugins: Plugins
-    model: SerializeAsAny[Network.Settings]
-    neighbourhood: SerializeAsAny[Neighbourhood.Settings]
+    model: SerializeAsAny[BaseModel]
+    neighbourhood: SerializeAsAny[BaseModel]
     data: SerializeAsAny[DataSettings]
     trainer: TrainerSettings
     optim: OptimSettings
@@ -108,10 +105,11 @@ class TrainConfig(Settings):
 
     @model_validator(mode="after")
     def _fit_together(self) -> Self:
-        network = Network.registered[self.model.name]
-        around = Neighbourhood.of(self.neighbourhood)
+        network = registered("model")[self.model.name]
+        neighbourhoods = registered("neighbourhood")
+        around = neighbourhoods[self.neighbourhood.name](self.neighbourhood)
         if network.reads != around.gives:
-            fitting = [n for n, c in Neighbourhood.registered.items() if c.gives == network.reads]
+            fitting = [n for n, cls in neighbourhoods.items() if cls.gives == network.reads]
             raise ValueError(
                 f"model {network.name} needs a neighbourhood that gives {network.reads} "
                 f"({', '.join(fitting)}), got neighbourhood {around.name}"
@@ -262,9 +260,9 @@ def read_stored_config(values: dict[str, Any], source: str = "the config") -> Tr
         MissingPluginError: Only a plugin defines the network, neighbourhood or data set.
     """
     values = upgraded(_as_dict(values))
-    for group, base in GROUPS.items():
+    for group in GROUPS:
         name = _name(values.get(group), group)
-        if name not in base.registered and values.get("plugins"):
+        if name not in registered(group) and values.get("plugins"):
             plugins = ",".join(map(str, values["plugins"]))
             raise MissingPluginError(
                 f"{source} needs {group} {name} of a plugin; to import it, add plugins=[{plugins}]"
@@ -319,7 +317,23 @@ def load_plugins(names: list[str]) -> None:
             raise ConfigError(f"plugins: cannot import {name} ({reason})") from error
 
 
-GROUPS = {"model": Network, "neighbourhood": Neighbourhood, "data": ShapeSet}
+GROUPS = ("model", "neighbourhood", "data")
+
+
+def registered(group: str) -> dict[str, Any]:
+    """The classes that a config group can name: networks, neighbourhoods or data sets."""
+    if group == "model":
+        from meshspiral.nn.networks import Network
+
+        return Network.registered
+    if group == "neighbourhood":
+        from meshspiral.neighbourhoods import Neighbourhood
+
+        return Neighbourhood.registered
+    import meshspiral.data.datasets  # noqa: F401  registers the data sets
+    from meshspiral.data.shapes import ShapeSet
+
+    return ShapeSet.registered
 
 
 def _as_dict(config: DictConfig | dict[str, Any]) -> dict[str, Any]:
@@ -339,22 +353,22 @@ def _read(schema: type[C], values: dict[str, Any]) -> C:
     values = dict(values)
     if schema is TrainConfig:
         _spread_metric(values)
-    for group, base in GROUPS.items():
+    for group in GROUPS:
         typed = schema.model_fields.get(group)
         if typed is None or _model(typed.annotation) is None:
             continue
-        name = _name(values.get(group), group)
-        if name not in base.registered:
-            choices = ", ".join(sorted(base.registered))
+        name, classes = _name(values.get(group), group), registered(group)
+        if name not in classes:
+            choices = ", ".join(sorted(classes))
             raise ConfigError(f"{group}.name must be one of {choices}, got {name}")
-        values[group] = _validated(base.registered[name].Settings, values[group], f"{group}.")
+        values[group] = _validated(classes[name].Settings, values[group], f"{group}.")
     return _validated(schema, values, "")
 
 
 def _spread_metric(values: dict[str, Any]) -> None:
     """Give the model the root key `metric`, which wins over what an experiment file sets."""
     model = values.get("model")
-    network = Network.registered.get(_name(model, "model"))
+    network = registered("model").get(_name(model, "model"))
     if network is None:
         return
     values["model"] = model = dict(model)
