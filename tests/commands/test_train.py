@@ -19,6 +19,7 @@ import torch
 from omegaconf import OmegaConf
 
 from meshspiral.data.datamodule import draw
+from meshspiral.data.shapes import DataError
 from meshspiral.data.sources import open_data
 from meshspiral.experiment.run_folder import (
     BEST,
@@ -36,7 +37,16 @@ from meshspiral.training.checkpoints import Checkpoint, WholeFiles
 from meshspiral.training.module import Correspondence
 from meshspiral.training.run import train
 from tests import helpers
-from tests.helpers import ROOT, composed, program_process, run, same_weights, wait_for, weights
+from tests.helpers import (
+    ROOT,
+    VTK_CRASHES,
+    composed,
+    program_process,
+    run,
+    same_weights,
+    wait_for,
+    weights,
+)
 
 
 @pytest.fixture(scope="module")
@@ -285,6 +295,29 @@ def test_a_killed_run_resumes_to_the_same_weights(toy_overrides, tmp_path):
     assert json.loads((folder / METRICS).read_text()).keys() >= helpers.METRICS
 
 
+def test_a_run_that_diverges_stops_with_a_one_line_error(toy_overrides, tmp_path):
+    with pytest.raises(RunError) as error:
+        run(tmp_path, [*toy_overrides, "optim.lr=1e30", "optim.warmup=0.5"])
+    message = str(error.value)
+    for part in (
+        "the loss must be finite",
+        "in epoch ",
+        "step ",
+        "learning rate",
+        "smaller optim.lr",
+    ):
+        assert part in message
+    assert not (tmp_path / METRICS).exists()
+    if (tmp_path / LAST).exists():
+        assert all(weight.isfinite().all() for weight in weights(tmp_path).values())
+
+
+def test_spirals_longer_than_a_mesh_give_a_one_line_error(toy_overrides, tmp_path):
+    message = r"train/\d: spirals must have at most the 162 vertices of the mesh, got 163"
+    with pytest.raises(DataError, match=message.replace("train/", "train_")):
+        run(tmp_path, [*toy_overrides, "seq_len=163"])
+
+
 @pytest.mark.parametrize("signum, code", [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
 def test_a_stopped_program_says_how_to_resume(toy_overrides, tmp_path, signum, code):
     folder = tmp_path / "run"
@@ -474,14 +507,10 @@ def test_renders_need_no_display(toy_overrides, tmp_path, monkeypatch):
         assert image.std(axis=(0, 1)).min() > 0.02
 
 
-def crash(*arguments):
-    os._exit(139)  # the exit code of a segmentation fault, as in VTK
-
-
 def test_without_opengl_renders_are_skipped_with_a_warning(
     toy_overrides, tmp_path, monkeypatch, caplog
 ):
-    monkeypatch.setattr("meshspiral.viz.render._render", crash)
+    monkeypatch.setattr("meshspiral.viz.render.COMMAND", VTK_CRASHES)
     run(tmp_path, [*toy_overrides, "optim.epochs=1", "picture=true"])
     assert "skipping renders: VTK failed; it needs an OpenGL library" in caplog.text
     assert (tmp_path / METRICS).is_file()

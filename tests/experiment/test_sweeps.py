@@ -32,6 +32,7 @@ from meshspiral.experiment.sweeps import (
     FAILED,
     invocation,
     job_states,
+    number_unfinished,
     run_folder,
     sweep_folder,
 )
@@ -136,6 +137,19 @@ def test_the_same_command_gives_the_same_sweep_folder():
     assert one.startswith("seed-0-1_metric-true-")
     assert one != folder("-m", "seed=0-1", "+metric=true")
     assert folder("-m") == "sweep"
+
+
+def test_a_sweep_with_a_stopped_job_has_not_succeeded(tmp_path):
+    for name, file in (("a", METRICS), ("b", CONFIG), ("c", FAILED)):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / CONFIG).touch()
+        content = (
+            '{"test/exact_match": 0, "test/geodesic_error": 0}' if file == METRICS else "reason"
+        )
+        (tmp_path / name / file).write_text(content)
+    assert number_unfinished(tmp_path) == 2
+    with alone(tmp_path / "b"):  # now it is running in another process
+        assert number_unfinished(tmp_path) == 1
 
 
 @pytest.mark.parametrize("launcher", ["joblib", "submitit_local"])

@@ -128,3 +128,13 @@ def test_an_open_piece_is_turned_only_if_its_volume_is_clearly_negative():
     sheet = lattice(5, 6)
     for faces in (sheet.faces, sheet.faces[:, ::-1]):
         assert outwards(Mesh(sheet.vertices, faces))[1] == 0
+
+
+def test_as_few_faces_as_possible_are_turned():
+    """50 flipped faces, among them the one whose winding trimesh follows."""
+    mesh = bumpy_sphere()
+    faces = mesh.faces.copy()
+    faces[:50] = faces[:50, ::-1]
+    repaired = repair(mesh.vertices, faces, "mesh")
+    assert repaired.changes == ["50 faces turned to agree with their neighbours"]
+    assert outwards(repaired.mesh)[1] == 0

@@ -16,7 +16,7 @@ from meshspiral.commands.match import main
 from meshspiral.data.files import atomic_file
 from meshspiral.matching.batch import find_sources
 from tests.conftest import toy_shapes
-from tests.helpers import ROOT, start, wait_for
+from tests.helpers import ROOT, VTK_CRASHES, start, wait_for
 
 TOYS = toy_shapes()
 SOURCE, TARGET = TOYS["test/0.ply"], TOYS["test/1.ply"]
@@ -138,17 +138,91 @@ def test_a_mesh_that_a_repair_cut_open_is_rendered(cli, trained, files):
     assert code == 0 and Path("many/a/correspondence.png").exists()
 
 
-def crash(*_):
-    os._exit(139)  # as VTK does without OpenGL, by a segmentation fault
-
-
 def test_without_opengl_renders_are_skipped(cli, trained, files, monkeypatch):
-    monkeypatch.setattr("meshspiral.viz.render._render", crash)
+    monkeypatch.setattr("meshspiral.viz.render.COMMAND", VTK_CRASHES)
     Path("out").mkdir()
     Path("out/correspondence.png").touch()  # of an earlier match
     code, out, err = cli("source=a.ply", f"run={trained}", "output=out", program=main)
     assert code == 0 and "skipping renders: VTK failed" in out + err
     assert Path("out/template.txt").exists() and not list(Path("out").glob("*.png"))
+
+
+def test_two_workers_render(cli, trained, scans):
+    words = ["sources=scans/*.ply", "target=b.ply", f"run={trained}", "output=out", "workers=2"]
+    code, out, err = cli(*words, "picture=true", program=main)
+    assert code == 0, out + err
+    for i in range(3):
+        for name in ("correspondence.png", "confidence.png"):
+            assert (scans.parent / f"out/{i}/{name}").read_bytes().startswith(b"\x89PNG")
+
+
+def test_a_mesh_whose_requested_render_failed_is_not_finished(cli, trained, scans, monkeypatch):
+    words = ["sources=scans/0.ply", f"run={trained}", "output=out", "workers=1", "picture=true"]
+    with monkeypatch.context() as broken:
+        broken.setattr("meshspiral.viz.render.COMMAND", VTK_CRASHES)
+        code, _, _ = cli(*words, program=main)
+    assert code == 1 and "scans/0.ply: VTK failed" in Path("out/refused.txt").read_text()
+    code, out, _ = cli(*words, program=main)
+    assert code == 0 and "already matched" not in out
+    assert Path("out/0/correspondence.png").is_file() and not Path("out/refused.txt").exists()
+
+
+def test_a_folder_that_cannot_be_written_does_not_stop_the_others(cli, trained, scans):
+    Path("out").mkdir()
+    Path("out/1").touch()
+    words = ["sources=scans", f"run={trained}", "output=out", "workers=2"]
+    code, out, err = cli(*words, program=main)
+    assert code == 1 and "Traceback" not in out + err
+    [line] = Path("out/refused.txt").read_text().splitlines()
+    assert line == "scans/1.ply: out/1: File exists"
+    assert Path("out/0/match.npz").is_file() and Path("out/2/match.npz").is_file()
+
+
+def test_a_symlink_loop_gives_each_file_once(scans, monkeypatch):
+    monkeypatch.chdir(scans.parent)
+    (scans / "loop").symlink_to(scans, target_is_directory=True)
+    found = find_sources("scans/**/*.ply", Path("out"))
+    assert found == {str(i): f"scans/{i}.ply" for i in range(3)}
+
+
+def test_a_folder_means_all_meshes_in_it(cli, scans, monkeypatch):
+    monkeypatch.chdir(scans.parent)
+    assert list(find_sources("scans", Path("out"))) == ["0", "1", "2"]
+    code, out, err = cli("source=scans", program=main)
+    assert code == 1 and "source=scans is a folder; to match all meshes in it: sources=scans" in (
+        out + err
+    )
+
+
+@pytest.mark.parametrize("name", ["...ply", "..ply", ".ply"])
+def test_results_of_any_name_stay_in_their_folder(cli, trained, files, name):
+    (files / "adv").mkdir()
+    export(files / "adv/a.ply", SOURCE)
+    (files / "adv/a.ply").rename(files / "adv" / name)
+    word = f"source='adv/{name}'"
+    code, out, err = cli(word, f"run={trained}", "picture=false", program=main)
+    if code:  # a name without suffix is not a mesh file
+        assert name == ".ply" and "format" in out + err
+        return
+    [folder] = (files / "outputs/matches").iterdir()
+    assert (folder / "match.npz").is_file() and not list((files / "outputs").glob("*.npz"))
+
+
+def test_two_files_are_source_and_target(cli, trained, files):
+    code, _, err = cli("a.ply", "b.ply", f"run={trained}", "picture=false", program=main)
+    assert code == 0, err
+    assert (files / "outputs/matches/a_to_b/map.txt").is_file()
+
+
+def test_a_target_shows_its_own_colours(cli, trained, files):
+    """Colours by its own coordinates; by its labels, its errors would hide those of the map."""
+    words = ["source=a.ply", "target=b.ply", f"run={trained}", "picture=false", "output=out"]
+    assert cli(*words, program=main)[0] == 0
+    target = trimesh.load("out/target.ply", process=False)
+    x = TARGET.vertices
+    expected = 0.1 + 0.9 * (x - x.min(axis=0)) / np.ptp(x, axis=0)
+    shown = target.visual.vertex_colors[:, :3] / 255
+    np.testing.assert_allclose(shown, expected, atol=0.01)
 
 
 @pytest.mark.parametrize(

@@ -182,9 +182,12 @@ def test_a_malicious_checkpoint_runs_nothing(trained, tmp_path):
     checkpoint.parent.mkdir(parents=True)
     saved = torch.load(trained / BEST, weights_only=True)
     torch.save({**saved, "extra": Malicious()}, checkpoint)
-    with pytest.raises(RunError, match="damaged"):
+    with pytest.raises(RunError, match="contains more than weights and was not opened"):
         Matcher.load(tmp_path / "run")
     assert not (tmp_path / "owned").exists()
+    checkpoint.write_bytes((trained / BEST).read_bytes()[:-100])
+    with pytest.raises(RunError, match="damaged"):
+        Matcher.load(tmp_path / "run")
 
 
 # ------------------------------------------------------------------------------- damaged meshes

@@ -6,7 +6,7 @@ import logging
 from pathlib import Path
 
 from meshspiral.experiment.entry import entry_point
-from meshspiral.experiment.run_folder import BEST, ERRORS, RunError, write_metrics
+from meshspiral.experiment.run_folder import BEST, ERRORS, METRICS, RunError, write_metrics
 from meshspiral.experiment.schema import EvaluateConfig
 
 log = logging.getLogger(__name__)
@@ -26,6 +26,14 @@ def main(config: EvaluateConfig) -> None:
         raise RunError(f"run={run} is not a folder")
     saved = read_checkpoint(run / BEST)
     trained = config_of(saved, str(run))
+    if not (run / METRICS).is_file():
+        epoch, epochs = saved["epoch"] + 1, trained.optim.epochs
+        log.warning(
+            "%s is not finished: this is its best checkpoint so far, epoch %d of %d",
+            run,
+            epoch,
+            epochs,
+        )
     settings = retest.config_on_data(trained, requested)
     retest.check_rotations(config.rotations, settings)
     predict = Predictor(saved, settings, config.accelerator)

@@ -9,6 +9,7 @@ from pathlib import Path
 from tqdm import tqdm
 
 from meshspiral.data.files import legal_name, write_file
+from meshspiral.data.mesh_files import SUFFIXES
 from meshspiral.data.shapes import DataError
 from meshspiral.experiment.entry import entry_point
 from meshspiral.experiment.schema import MatchConfig
@@ -21,13 +22,28 @@ CONTENTS = {
     "remarks.txt": "confidences and defects of the meshes",
     "source.ply target.ply": "the meshes; corresponding points have equal colours",
     "transferred.npy transferred.ply transferred.obj": "the target's values, on the source",
-    "correspondence.png confidence.png": "the meshes from the front and the back",
+    "correspondence.png confidence.png": "renders from the front and the back",
 }
 
 log = logging.getLogger(__name__)
 
 
-@entry_point("match", MatchConfig)
+def name_files(words: list[str]) -> list[str]:
+    """`match a.ply b.ply` as `match source=a.ply target=b.ply`.
+
+    Args:
+        words: The words of a command line; one with the suffix of a mesh file and no = is a file.
+    """
+    roles = iter(("source", "target"))
+    named = []
+    for word in words:
+        is_file = "=" not in word and word.lower().endswith(SUFFIXES)
+        role = next(roles, None) if is_file else None
+        named.append(f"{role}='{word}'" if role else word)
+    return named
+
+
+@entry_point("match", MatchConfig, rewrite=name_files)
 def main(config: MatchConfig) -> None:
     folder = match_many(config) if config.sources else match_one(config)
     log.info("Written to:  %s", folder)
@@ -39,10 +55,15 @@ def match_one(config: MatchConfig) -> Path:
     from meshspiral.matching.pair import match_file
     from meshspiral.matching.writing import remark_lines, write_target
 
+    if Path(config.source).is_dir():
+        raise DataError(
+            f"source={config.source} is a folder; to match all meshes in it: "
+            f"sources={config.source}"
+        )
     name = Path(config.source).stem
     if config.target:
         name += f"_to_{Path(config.target).stem}"
-    folder = Path(config.output or Path("outputs", "matches", name))
+    folder = Path(config.output or Path("outputs", "matches", legal_name(name)))
     job = MatchJob(config, render=config.picture is not False)
     began = time.perf_counter()
     meshes = 2 if config.target else 1

@@ -200,6 +200,7 @@ class CorrespondenceData(L.LightningDataModule):
         shapes, tasks = [], []
         for _, name in tqdm(names, desc="Meshes", unit="mesh", delay=1.0):
             shape = self.shape(name)
+            self._check_length(name, len(shape.labels))
             shapes.append(shape)
             descriptors = descriptor_task(shape.mesh, self.shot)
             tasks.append((descriptors, neighbourhood_task(shape.mesh, self.neighbourhood)))
@@ -235,6 +236,14 @@ class CorrespondenceData(L.LightningDataModule):
             items[split].append(item)
         for split in wanted:
             self.datasets[split] = MeshDataset(self.shapes.names[split], items[split])
+
+    def _check_length(self, name: str, vertices: int) -> None:
+        length = self.neighbourhood.length
+        if length is not None and length > vertices:
+            raise DataError(
+                f"{name}: {self.neighbourhood.noun} must have at most the {vertices:,} vertices of "
+                f"the mesh, got {length:,}"
+            )
 
     def train_dataloader(self) -> DataLoader:
         skip, self._skip = self._skip, 0

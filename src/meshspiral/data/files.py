@@ -33,7 +33,9 @@ def atomic_file(path: Path, sync: bool = False) -> Iterator[BinaryIO]:
                 file.flush()
                 os.fsync(file.fileno())
         os.replace(temporary, path)
-    except BaseException:
+    except BaseException as error:
+        if isinstance(error, OSError) and error.filename is None:
+            error.filename = str(path)  # a full disk names no file
         with contextlib.suppress(OSError):
             temporary.unlink()
         raise
@@ -53,8 +55,11 @@ def write_arrays(path: Path, **arrays: np.ndarray) -> None:
 
 
 def legal_name(name: str) -> str:
-    """A file name without special characters, at most 130 long; different names stay different."""
-    legal = re.sub(r"[^\w.+-]+", "-", name).encode()[:120].decode(errors="ignore")
+    """A file name of at most 130 bytes, without special characters or a leading dot.
+
+    Different names stay different.
+    """
+    legal = re.sub(r"^\.+|[^\w.+-]+", "-", name).encode()[:120].decode(errors="ignore")
     if legal != name:  # what was lost may be what tells two names apart
         legal += "-" + hashlib.sha256(name.encode()).hexdigest()[:8]
     return legal

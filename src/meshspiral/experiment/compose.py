@@ -6,12 +6,26 @@ from pathlib import Path
 
 from hydra import compose, initialize_config_dir
 from hydra.core.global_hydra import GlobalHydra
+from omegaconf import OmegaConf
 
-from meshspiral.experiment.schema import TrainConfig, read_config
+from meshspiral.experiment.schema import TrainConfig, flat, read_config
 
 PACKAGE = Path(__file__).parents[1]
 # in a clone conf/ is at its root; an installed package contains a copy
 CONF = str(next(p for p in (PACKAGE.parents[1] / "conf", PACKAGE / "conf") if p.is_dir()))
+
+
+def known_keys(command: str) -> list[str]:
+    """What can stand before = on the command line of a command: settings and config groups."""
+    before = GlobalHydra.instance().hydra
+    GlobalHydra.instance().clear()
+    try:
+        with initialize_config_dir(CONF, version_base="1.3"):
+            tree = OmegaConf.to_container(compose(command))
+    finally:
+        GlobalHydra.instance().hydra = before
+    groups = {"experiment"} if command == "train" else set()
+    return sorted({*flat(tree), *tree, *groups})
 
 
 def compose_train(overrides: list[str]) -> TrainConfig:

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import difflib
 import itertools
 import logging
 import os
+import re
 import signal
 import sys
 import traceback
@@ -22,11 +24,12 @@ from pydantic import BaseModel
 
 from meshspiral.data.files import write_file
 from meshspiral.data.shapes import DataError
-from meshspiral.experiment.compose import CONF
+from meshspiral.experiment.compose import CONF, known_keys
 from meshspiral.experiment.help import settings_help
+from meshspiral.experiment.program import command_line
 from meshspiral.experiment.run_folder import RunError, Stopped
 from meshspiral.experiment.schema import MOVED, ConfigError, read_config
-from meshspiral.experiment.sweeps import invocation, note_failure, number_failed, show_table
+from meshspiral.experiment.sweeps import invocation, note_failure, number_unfinished, show_table
 from meshspiral.geometry.mesh import MeshError
 
 USER_ERRORS = (
@@ -44,7 +47,9 @@ Config = TypeVar("Config", bound=BaseModel)
 
 
 def entry_point(
-    name: str, schema: type[Config]
+    name: str,
+    schema: type[Config],
+    rewrite: Callable[[list[str]], list[str]] = list,
 ) -> Callable[[Callable[[Config], None]], Callable[[], None]]:
     """Make a function of a config a program, with the composed config of conf/<name>.yaml.
 
@@ -55,14 +60,20 @@ def entry_point(
     Args:
         name: Name of the command.
         schema: The type of the config.
+        rewrite: Turns the words of the command line into those that Hydra reads.
     """
 
     def decorate(task: Callable[[Config], None]) -> Callable[[], None]:
         def main() -> None:
             failed: list[str] = []
+            logging.raiseExceptions = False  # a full disk is reported once, not by each message
             os.environ.setdefault("HYDRA_FULL_ERROR", "1")  # Hydra raises errors; we word them
             signal.signal(signal.SIGTERM, _stop)
             signal.signal(signal.SIGINT, _stop)
+            if hint := dashed_setting(sys.argv[1:], schema):
+                print(f"error: {hint}", file=sys.stderr)
+                sys.exit(2)
+            sys.argv[1:] = rewrite(sys.argv[1:])
             with invocation(sys.argv[1:]) as call:
                 try:
 
@@ -75,7 +86,9 @@ def entry_point(
                     print(f"\n{stopped}{again}", file=sys.stderr)
                     sys.exit(128 + stopped.signum)
                 except USER_ERRORS as error:
-                    print(f"error: {one_line(error)}", file=sys.stderr)
+                    print(
+                        f"error: {unknown_setting(name, error) or one_line(error)}", file=sys.stderr
+                    )
                     sys.exit(2 if isinstance(error, HydraException) else 1)
                 except Exception as error:
                     if "Config group override" in str(error):  # Hydra's, for model=null
@@ -94,7 +107,7 @@ def entry_point(
                         file=sys.stderr,
                     )
                     sys.exit(1)
-                if failed or (call.sweep and number_failed(call.sweep)):
+                if failed or (call.sweep and number_unfinished(call.sweep)):
                     sys.exit(1)
 
         return main
@@ -122,6 +135,26 @@ def _run_job(
     failed.append(reason)
     if folder:
         note_failure(folder, reason)
+
+
+def dashed_setting(words: list[str], schema: type[BaseModel]) -> str | None:
+    """What to type instead of the first word such as --seed=1 or --seed 1, if there is one."""
+    for i, word in enumerate(words):
+        name, _, value = word.removeprefix("--").partition("=")
+        if word.startswith("--") and name in schema.model_fields:
+            value = value or (words[i + 1] if i + 1 < len(words) else "...")
+            return f"{word} is not an option; settings have no dashes: {name}={value}"
+    return None
+
+
+def unknown_setting(command: str, error: BaseException) -> str | None:
+    """A message with the closest known setting, if Hydra does not know one; None otherwise."""
+    unknown = re.search(r"Could not override '[+~]*([^']+)'", str(error))
+    if unknown is None or any(unknown[1].startswith(old) for old in MOVED):
+        return None
+    close = difflib.get_close_matches(unknown[1], known_keys(command), n=1)
+    hint = f"did you mean {close[0]}?" if close else f"{command_line(command)} --help lists them"
+    return f"unknown setting {unknown[1]}; {hint}"
 
 
 def _stop(signum: int, frame: object) -> None:

@@ -50,7 +50,7 @@ Plugins = Annotated[
     Field(description="modules to import, which register networks, neighbourhoods or data sets"),
 ]
 Accelerator = Annotated[Literal["cpu", "gpu"], Field(description="cpu or gpu")]
-Threads = Annotated[int | None, Field(ge=1, description="threads; null: one per core")]
+Threads = Annotated[int | None, Field(ge=1, le=1024, description="threads; null: one per core")]
 
 
 class OptimSettings(Settings):

@@ -130,9 +130,10 @@ def note_failure(folder: Path, reason: str | None) -> None:
             write_file(folder / FAILED, reason + "\n")
 
 
-def number_failed(folder: Path) -> int:
-    """How many jobs of a sweep failed."""
-    return len(list(folder.glob(f"*/{FAILED}")))
+def number_unfinished(folder: Path) -> int:
+    """How many jobs of a sweep failed, or were stopped and are not running in another process."""
+    stopped = [row for row in job_states(folder) if row[1] == "stopped"]
+    return len(list(folder.glob(f"*/{FAILED}"))) + len(stopped)
 
 
 def job_states(folder: Path) -> list[tuple[str, str, str]]:

@@ -96,9 +96,7 @@ def repair(vertices: np.ndarray, faces: np.ndarray, name: str) -> Repaired:
     before = len(faces)
     faces = _fill_holes(vertices, faces)
     note(len(faces) - before, "faces added to close holes")
-    solid = trimesh.Trimesh(vertices, faces, process=False)
-    trimesh.repair.fix_winding(solid)
-    turned = np.asarray(solid.faces, dtype=np.int64)
+    turned = _turned(vertices, faces)
     note(int((turned != faces).any(axis=1).sum()), "faces turned to agree with their neighbours")
     inconsistent = _multiplicity(directed_edges(turned)) > 1
     vertices, faces, copied, cuts = _cut_open(vertices, turned, inconsistent)
@@ -125,10 +123,7 @@ def outwards(mesh: Mesh) -> tuple[Mesh, int]:
     Returns:
         The mesh with the faces of these pieces reversed, and the number of these pieces.
     """
-    solid = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
-    pairs = solid.face_adjacency
-    graph = coo_array((np.ones(len(pairs)), tuple(pairs.T)), shape=(len(mesh.faces),) * 2)
-    count, piece = connected_components(graph, directed=False)
+    count, piece, pairs = _pieces(mesh.vertices, mesh.faces)
     corners = mesh.vertices[mesh.faces]
     sizes = np.bincount(piece, minlength=count)[:, None]
     centres = np.stack(
@@ -142,6 +137,25 @@ def outwards(mesh: Mesh) -> tuple[Mesh, int]:
     inside_out = volume < np.where(closed, 0.0, -CLEARLY * sphere)
     faces = np.where(inside_out[piece][:, None], mesh.faces[:, ::-1], mesh.faces)
     return Mesh(mesh.vertices, faces, mesh.name), int(inside_out.sum())
+
+
+def _pieces(vertices: np.ndarray, faces: np.ndarray) -> tuple[int, np.ndarray, np.ndarray]:
+    """The pieces that edges connect: their number; the piece of every face, int [F]; and the pairs
+    of faces with a common edge, int [P, 2]."""
+    pairs = trimesh.Trimesh(vertices, faces, process=False).face_adjacency
+    graph = coo_array((np.ones(len(pairs)), tuple(pairs.T)), shape=(len(faces),) * 2)
+    return *connected_components(graph, directed=False), pairs
+
+
+def _turned(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """The faces, turned to agree with their neighbours: in each piece as few as possible."""
+    solid = trimesh.Trimesh(vertices, faces, process=False)
+    trimesh.repair.fix_winding(solid)  # agrees with an arbitrary face of each piece
+    turned = np.asarray(solid.faces, dtype=np.int64)
+    changed = (turned != faces).any(axis=1)
+    _, piece, _ = _pieces(vertices, turned)
+    most = 2 * np.bincount(piece, changed) > np.bincount(piece)
+    return np.where(most[piece][:, None], turned[:, ::-1], turned)
 
 
 def _joined(vertices: np.ndarray, finite: np.ndarray) -> np.ndarray:

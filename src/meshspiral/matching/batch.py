@@ -12,6 +12,7 @@ import torch
 from joblib import cpu_count
 from tqdm import tqdm
 
+from meshspiral.data.files import legal_name
 from meshspiral.data.mesh_files import SUFFIXES
 from meshspiral.data.pool import run_in_pool
 from meshspiral.data.shapes import DataError
@@ -19,6 +20,7 @@ from meshspiral.geometry.mesh import MeshError
 from meshspiral.matching.job import MatchJob
 from meshspiral.matching.pair import match_file
 from meshspiral.matching.writing import is_finished
+from meshspiral.viz.render import RenderError
 
 log = logging.getLogger(__name__)
 
@@ -50,6 +52,8 @@ def match_batch(
 ) -> BatchResult:
     """Match sources, except those that are finished. A source that cannot be used is refused.
 
+    So is one whose files cannot be written.
+
     Args:
         job: What the sources share.
         sources: Paths by name, see `find_sources`.
@@ -58,7 +62,6 @@ def match_batch(
 
     Raises:
         DataError: A worker process was killed.
-        OSError: A file cannot be written.
     """
     waiting = {
         name: path for name, path in sources.items() if not is_finished(job, path, folder / name)
@@ -84,9 +87,13 @@ def _match_source(job: MatchJob, path: str, folder: Path, processes: int) -> Sou
         torch.set_num_threads(1)
     try:
         match = match_file(job, path, folder)
-    except (MeshError, DataError) as error:
-        return SourceResult(path, str(error), False)
-    return SourceResult(path, None, match.source.scan.repaired)
+    except (MeshError, DataError, RenderError) as error:
+        reason = str(error)
+    except OSError as error:
+        reason = f"{error.filename}: {error.strerror}" if error.filename else str(error)
+    else:
+        return SourceResult(path, None, match.source.scan.repaired)
+    return SourceResult(path, reason if path in reason else f"{path}: {reason}", False)
 
 
 def find_sources(pattern: str, output: Path) -> dict[str, str]:
@@ -96,7 +103,7 @@ def find_sources(pattern: str, output: Path) -> dict[str, str]:
     suffix is part of the name only where names would be equal without it.
 
     Args:
-        pattern: As for `glob.glob`; ** matches folders at any depth.
+        pattern: As for `glob.glob`; ** matches folders at any depth. Or a folder: all files in it.
         output: Files in this folder are left out: they are results.
 
     Returns:
@@ -105,21 +112,26 @@ def find_sources(pattern: str, output: Path) -> dict[str, str]:
     Raises:
         DataError: No mesh file matches.
     """
+    matches = os.path.join(glob.escape(pattern), "*") if os.path.isdir(pattern) else pattern
     paths = sorted(
         path
-        for path in glob.glob(pattern, recursive=True)
+        for path in glob.glob(matches, recursive=True)
         if path.lower().endswith(SUFFIXES)
         and os.path.isfile(path)
         and not Path(path).resolve().is_relative_to(output.resolve())
     )
     if not paths:
         raise DataError(f"sources: no mesh file ({', '.join(SUFFIXES)}) matches {pattern!r}")
+    files: dict[str, str] = {}  # a symbolic link must not make two sources of one file
+    for path in sorted(paths, key=len):
+        files.setdefault(os.path.realpath(path), path)
+    paths = sorted(files.values())
     shared = os.path.commonpath([os.path.dirname(os.path.abspath(path)) for path in paths])
     names = [os.path.relpath(os.path.abspath(path), shared).replace(os.sep, "_") for path in paths]
     stems = [os.path.splitext(name)[0] for name in names]
     sources: dict[str, str] = {}
     for stem, name, path in zip(stems, names, paths, strict=True):
-        name = stem if stems.count(stem) == 1 else name
+        name = legal_name(stem if stems.count(stem) == 1 else name)
         while name in sources:
             name += "_"
         sources[name] = path

@@ -9,6 +9,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from meshspiral.data.files import write_file
+from meshspiral.data.scans import Scan
 from meshspiral.geometry.mesh import Mesh
 from meshspiral.matching.job import FileMatch, LabelledScan
 from meshspiral.matching.transfer import transfer
@@ -19,21 +20,25 @@ from meshspiral.viz.render import RenderError, Row, render
 log = logging.getLogger(__name__)
 
 
-def draw_pictures(folder: Path, match: FileMatch, template: Mesh, up: str) -> None:
+def draw_pictures(folder: Path, match: FileMatch, template: Mesh, up: str, required: bool) -> None:
     """Render correspondence.png and confidence.png.
 
     Both show the target, or the template without one, and beside it the source, in the template's
-    pose. Without an OpenGL library, a warning says that they are skipped.
+    pose.
 
     Args:
         folder: Where to write them.
         match: What to show.
         template: The template of the labels.
         up: The template's axis that points up, "y" or "z".
+        required: Whether a failure is an error; otherwise a warning says that renders are skipped.
+
+    Raises:
+        RenderError: Rendering failed, and the pictures are required.
     """
     source, target = match.source, match.target
     if target:
-        target_colors = point_colors(template, target.labels.points)
+        target_colors = own_colors(target.scan)
         source_colors = transfer(target_colors, match.map, GREY)
         colors = [target.on_mesh(target_colors), source.on_mesh(source_colors)]
         meshes = [align_to_template(target, template), align_to_template(source, template)]
@@ -48,6 +53,8 @@ def draw_pictures(folder: Path, match: FileMatch, template: Mesh, up: str) -> No
     try:
         correspondence, confidence = render(rows, up)
     except RenderError as error:
+        if required:
+            raise
         log.warning("skipping renders: %s", error)
         return
     captions = ["target" if target else "template", "source"]
@@ -57,6 +64,14 @@ def draw_pictures(folder: Path, match: FileMatch, template: Mesh, up: str) -> No
     }
     for name, figure in figures.items():
         write_file(folder / f"{name}.png", encoded(figure, "png"))
+
+
+def own_colors(scan: Scan) -> np.ndarray:
+    """Colours of a user's vertices by their own coordinates, float [V, 3]: smooth over the mesh.
+
+    Carried to another mesh by a map, they show where the map is wrong.
+    """
+    return point_colors(scan.mesh, scan.vertices)
 
 
 def align_to_template(labelled: LabelledScan, template: Mesh) -> Mesh:

@@ -14,7 +14,7 @@ from meshspiral.data.scans import Scan
 from meshspiral.data.shapes import DataError
 from meshspiral.geometry.mesh import MeshError
 from meshspiral.matching.job import FileMatch, MatchJob
-from meshspiral.matching.pictures import draw_pictures
+from meshspiral.matching.pictures import draw_pictures, own_colors
 from meshspiral.matching.transfer import transfer
 from meshspiral.viz.colors import GREY, point_colors
 
@@ -45,6 +45,7 @@ def write_match(job: MatchJob, match: FileMatch, folder: Path) -> None:
     Raises:
         DataError: A file would overwrite an input, or the folder has the match of another mesh.
         OSError: A file cannot be written.
+        RenderError: A render failed that the command line asked for.
     """
     check_inputs(folder, match.path, *job.inputs)
     _check_owner(folder, match.path)
@@ -55,8 +56,7 @@ def write_match(job: MatchJob, match: FileMatch, folder: Path) -> None:
     if match.target:
         arrays["map"] = match.map
         write_integers(folder / "map.txt", match.map)
-        target_colors = point_colors(template, match.target.labels.points)
-        colors = transfer(target_colors, match.map, GREY)
+        colors = transfer(own_colors(match.target.scan), match.map, GREY)
     else:
         colors = point_colors(template, labels.points)
     write_integers(folder / "template.txt", labels.template)
@@ -66,7 +66,8 @@ def write_match(job: MatchJob, match: FileMatch, folder: Path) -> None:
         values = transfer(job.transfer_values, match.map, 0)
         write_transferred(folder, scan, values, job.config.transfer)
     if job.render:
-        draw_pictures(folder, match, template, job.matcher.up)
+        required = job.config.picture is True
+        draw_pictures(folder, match, template, job.matcher.up, required)
     origin = {"key": np.array(job.key(match.path)), "source": np.array(_absolute(match.path))}
     write_arrays(folder / RESULT, **origin, **arrays)  # the last file: now the match is complete
 
@@ -82,8 +83,7 @@ def write_target(job: MatchJob, folder: Path) -> None:
     folder.mkdir(parents=True, exist_ok=True)
     scan, labels = job.target
     write_arrays(folder / "target.npz", **labels._asdict())
-    colors = point_colors(job.matcher.template, labels.points)
-    write_colored_mesh(folder / "target.ply", scan, colors)
+    write_colored_mesh(folder / "target.ply", scan, own_colors(scan))
 
 
 def is_finished(job: MatchJob, path: str, folder: Path) -> bool:
@@ -177,7 +177,10 @@ def write_transferred(folder: Path, scan: Scan, values: np.ndarray, kind: str) -
     if kind == "uv":
         mesh = _user_mesh(scan, visual=trimesh.visual.TextureVisuals(uv=values))
         text = trimesh.exchange.obj.export_obj(mesh, include_normals=False, write_texture=False)
-        write_file(folder / "transferred.obj", text)
+        lines = text.splitlines()
+        # there is no material to name
+        kept = [line for line in lines if not line.startswith(("mtllib", "usemtl"))]
+        write_file(folder / "transferred.obj", "\n".join(kept) + "\n")
 
 
 def _user_mesh(scan: Scan, **visual: Any) -> trimesh.Trimesh:

@@ -67,6 +67,10 @@ def read_checkpoint(path: Path) -> dict[str, Any]:
         if not {"config", "in_features", "num_classes"} <= saved["hyper_parameters"].keys():
             raise KeyError("hyper-parameters are missing")
     except Exception as error:  # whatever a damaged file makes torch raise
+        if "GLOBAL" in str(error):  # torch refuses to call a function that the file names
+            raise RunError(
+                f"{path} contains more than weights and was not opened: that could run its code"
+            ) from error
         reason = (str(error).splitlines() or [repr(error)])[0][:100]
         raise RunError(f"{path} is damaged ({reason})") from error
     return saved

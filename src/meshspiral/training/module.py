@@ -12,6 +12,7 @@ from torch import Tensor, nn
 
 from meshspiral.evaluation.metrics import CorrespondenceError
 from meshspiral.evaluation.outcome import Result, result_of
+from meshspiral.experiment.run_folder import RunError
 from meshspiral.experiment.schema import TrainConfig, read_stored_config
 from meshspiral.geometry.digest import derived_seed
 from meshspiral.neighbourhoods import Neighbourhood
@@ -31,6 +32,9 @@ def build_network(config: TrainConfig, in_features: int, num_classes: int) -> Ne
     network = Network.registered[config.model.name]
     neighbourhood = Neighbourhood.of(config.neighbourhood)
     return network.build(config.model, neighbourhood, in_features, num_classes)
+
+
+CHECK_EVERY = 10  # steps between two checks of the loss on a GPU, each of which waits for it
 
 
 class Correspondence(L.LightningModule):
@@ -73,8 +77,19 @@ class Correspondence(L.LightningModule):
         loss = linear_cross_entropy(
             self.net.embed_batch(batch), head.weight, head.bias, batch["labels"]
         )
+        if self.device.type == "cpu" or batch_idx % CHECK_EVERY == 0:
+            self._check_finite(loss, batch_idx)
         self.log("train/loss", loss, on_step=True, on_epoch=True, batch_size=1, sync_dist=True)
         return loss
+
+    def _check_finite(self, loss: Tensor, batch_idx: int) -> None:
+        if not bool(torch.isfinite(loss)):
+            rate = self.optimizers().param_groups[0]["lr"]
+            raise RunError(
+                f"training diverged: the loss must be finite, got {float(loss)} in epoch "
+                f"{self.current_epoch + 1}, step {batch_idx + 1}, at learning rate {rate:.3g}; try "
+                f"a smaller optim.lr (it is {self.optim.lr:g}). The checkpoints are from before"
+            )
 
     def validation_step(self, batch: Batch, batch_idx: int) -> None:
         self._evaluate("val", batch)

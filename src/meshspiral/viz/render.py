@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import os
-import signal
+import pickle
+import subprocess
 import sys
-from concurrent.futures import ProcessPoolExecutor
-from concurrent.futures.process import BrokenProcessPool
-from multiprocessing import get_context
+import tempfile
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -15,6 +15,8 @@ import numpy as np
 from meshspiral.geometry.mesh import Mesh
 
 VIEWS = ("front", "back")
+# of the process that renders; two files are its last words: the request and the answer
+COMMAND = [sys.executable, "-c", "from meshspiral.viz.render import answer; answer()"]
 
 
 class RenderError(RuntimeError):
@@ -59,15 +61,36 @@ def render(rows: list[Row], up: str, views: tuple[str, ...] = VIEWS) -> list[Pic
     Raises:
         RenderError: VTK finds no OpenGL library.
     """
-    # Without OpenGL, VTK crashes its process; so it gets one of its own, which ignores Ctrl-C.
-    context, ignore = get_context("spawn"), (signal.SIGINT, signal.SIG_IGN)
-    with ProcessPoolExecutor(1, context, initializer=signal.signal, initargs=ignore) as process:
-        try:
-            return process.submit(_render, rows, up, views).result()
-        except (BrokenProcessPool, ImportError) as error:
-            raise RenderError(
-                "VTK failed; it needs an OpenGL library (on Debian: libegl1, libgl1)"
-            ) from error
+    # Without OpenGL, VTK crashes its process, so it gets one of its own: a plain one, since
+    # multiprocessing's does not start within the workers of other pools. Ctrl-C does not reach it.
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
+    with tempfile.TemporaryDirectory() as folder:
+        request, result = Path(folder, "request"), Path(folder, "result")
+        request.write_bytes(pickle.dumps((rows, up, views)))
+        process = subprocess.run(
+            [*COMMAND, request, result],
+            env=environment,
+            capture_output=True,
+            start_new_session=True,
+            check=False,
+        )
+        if result.is_file():
+            return pickle.loads(result.read_bytes())
+    lines = process.stderr.decode(errors="replace").strip().splitlines()
+    reason = f" ({lines[-1]})" if lines else ""
+    raise RenderError(
+        f"VTK failed{reason}; it needs an OpenGL library (on Debian: libegl1, libgl1)"
+    )
+
+
+def answer() -> None:
+    """Render the rows of a request, in a process of its own; see `render`."""
+    request, result = map(Path, sys.argv[1:])
+    rows, up, views = pickle.loads(request.read_bytes())
+    pictures = [_render_row(*row, up, views) for row in rows]
+    partial = result.with_suffix(".part")
+    partial.write_bytes(pickle.dumps(pictures))
+    partial.replace(result)
 
 
 def upright(vertices: np.ndarray, up: str, view: str = "front") -> np.ndarray:
@@ -85,10 +108,6 @@ def upright(vertices: np.ndarray, up: str, view: str = "front") -> np.ndarray:
     if up == "z":
         y, z = z, -y
     return np.stack([-x, y, -z] if view == "back" else [x, y, z], axis=1)
-
-
-def _render(rows, up, views):
-    return [_render_row(*row, up, views) for row in rows]
 
 
 def _render_row(meshes, colors, up, views):
