@@ -13,6 +13,7 @@ COMMANDS = {
     "report": "show many runs on one page",
     "meshes": "list the meshes of a data set",
     "benchmark": "measure what a training step costs",
+    "doctor": "print what a bug report needs",
 }
 
 

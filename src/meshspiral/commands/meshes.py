@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import logging
 
-from tqdm import tqdm
-
 from meshspiral.data.shapes import SPLITS, DataError
 from meshspiral.experiment.entry import entry_point
 from meshspiral.experiment.schema import MeshesConfig
@@ -26,7 +24,7 @@ COLUMNS = {  # title: meaning
     "off source": "Hausdorff distance to the original mesh over the mean edge length",
     "off label": "mean distance from the true point to its label over the mean edge length",
 }
-WIDTH = 11
+WIDTHS = [max(len(title), 6) for title in COLUMNS]
 
 
 @entry_point("meshes", MeshesConfig)
@@ -44,18 +42,18 @@ def main(config: MeshesConfig) -> None:
     for title, meaning in COLUMNS.items():
         log.info("%s: %s", title, meaning)
     width = max(map(len, names))
-    log.info("\n%s", " ".join([" " * width, *(title.rjust(WIDTH) for title in COLUMNS)]))
+    log.info("\n%s", " ".join([" " * width, *(map(str.rjust, COLUMNS, WIDTHS))]))
     rows, previous = [], shapes.load(names[-1]) if len(names) > 1 else None
-    for name in tqdm(names, desc="Meshes", leave=False, delay=1.0):
+    for name in names:  # no progress bar: the rows show the progress
         shape = shapes.load(name)
         rows.append(mesh_statistics(shape, previous, shapes, name))
         previous = shape
-        tqdm.write(" ".join([name.ljust(width), *map(format_value, rows[-1])]))
+        log.info("%s", " ".join([name.ljust(width), *map(format_value, rows[-1], WIDTHS)]))
     means = mean_statistics(rows)
-    log.info("%s", " ".join(["mean".ljust(width), *map(format_value, means)]))
+    log.info("%s", " ".join(["mean".ljust(width), *map(format_value, means, WIDTHS)]))
 
 
-def format_value(value: float | int | bool | None) -> str:
+def format_value(value: float | int | bool | None, width: int) -> str:
     """A value of a statistic, in a column's width; - for None and NaN."""
     if value is None or value != value:
         text = "-"
@@ -63,7 +61,7 @@ def format_value(value: float | int | bool | None) -> str:
         text = "yes" if value else "no"
     else:
         text = f"{value:.2f}" if isinstance(value, float) else str(value)
-    return text.rjust(WIDTH)
+    return text.rjust(width)
 
 
 if __name__ == "__main__":

@@ -13,6 +13,7 @@ from meshspiral.experiment.program import command_line
 from meshspiral.experiment.schema import (
     GROUPS,
     BenchmarkConfig,
+    DoctorConfig,
     EvaluateConfig,
     MatchConfig,
     MeshesConfig,
@@ -30,6 +31,7 @@ COMMANDS = {
     "meshes": MeshesConfig,
     "report": ReportConfig,
     "benchmark": BenchmarkConfig,
+    "doctor": DoctorConfig,
 }
 HIDDEN_GROUPS = ("cli", "hydra")
 

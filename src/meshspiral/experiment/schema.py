@@ -232,6 +232,13 @@ class BenchmarkConfig(Settings):
     plugins: Plugins
 
 
+class DoctorConfig(Settings):
+    """Settings of `doctor`."""
+
+    cache_dir: Text = Field(description="folder of cached results")
+    plugins: Plugins
+
+
 # ---------------------------------------------------------------------------------- reading configs
 
 

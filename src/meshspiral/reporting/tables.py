@@ -60,7 +60,7 @@ def group_table(groups: list[Group]) -> tuple[list[str], list[list[str]]]:
         cells = [*attribute_cells(group), len(group.seeds)]
         cells += [dict(group.others).get(key) for key in others]
         metrics = [
-            format_metric([metric_value(run, key) for run in group.runs], key)
+            format_metric([metric_value(run, key) for run in group.runs], key, len(group.seeds) > 1)
             for key in METRIC_COLUMNS
         ]
         rows.append([*map(format_value, cells), *metrics])
@@ -79,21 +79,22 @@ def metric_value(run: Run, key: str) -> float:
     return 100 * value if "%" in METRIC_COLUMNS[key] else value
 
 
-def format_metric(values: list[float], key: str) -> str:
+def format_metric(values: list[float], key: str, deviates: bool = False) -> str:
     """A metric as text.
 
     Args:
         values: One value for each run, in the unit of the column.
         key: Key of `METRIC_COLUMNS`.
+        deviates: Whether the runs differ in the seed, so that their deviation has a meaning.
 
     Returns:
-        The mean, with the population standard deviation if there are several runs; a dash if a run
-        lacks the metric.
+        The mean, and with `deviates` the population standard deviation; a dash if a run lacks the
+        metric.
     """
     if key == "parameters":
         return f"{values[0]:,.0f}"
     digits = 1 if "%" in METRIC_COLUMNS[key] else 0 if key.startswith("seconds") else 4
-    deviation = f" ± {np.std(values):.{digits}f}" if len(values) > 1 else ""
+    deviation = f" ± {np.std(values):.{digits}f}" if deviates else ""
     if np.isnan(values).any():
         return "\u2013"
     return f"{np.mean(values):.{digits}f}{deviation}"
