@@ -25,6 +25,7 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from meshspiral.__main__ import COMMANDS
+from meshspiral.commands.match import name_files
 from meshspiral.data.datasets.bodies import Bodies
 from meshspiral.experiment.help import COMMANDS as SCHEMAS
 from meshspiral.experiment.schema import ConfigError, read_config
@@ -158,6 +159,7 @@ def check(line: str) -> None:
         assert (ROOT / "src" / f"{command}.py").is_file(), f"no command src.{command}"
     assert command in COMMANDS, f"no command {command}"
     words = [word for word in words if not word.startswith("-") and word not in ("job", "all")]
+    words = name_files(words) if command == "match" else words
     for job in jobs(words):
         if job or command in ("train", "benchmark", "meshes"):  # the others need a word
             check_job(command, job)
