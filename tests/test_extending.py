@@ -99,6 +99,15 @@ def test_a_network_is_a_module_and_a_yaml_file(clone, toy_overrides):
     assert [row["network"] for row in json.loads(benchmarked.read_text())["steps"]] == ["conv1d"]
 
 
+def test_a_neighbourhood_is_a_module_and_a_yaml_file(clone, toy_overrides):
+    toy = [o for o in toy_overrides if not o.startswith(("seq_len", "optim"))]
+    quick = [*toy, "optim.epochs=1", "optim.warmup=0", "hydra.run.dir=outputs/nearest"]
+    [train] = words_of("neighbourhood commands")
+    out = call(clone, [*train, *quick], ["src.report", "runs=outputs/nearest", "shapes=0"])
+    assert "the 10 nearest vertices without metric information" in out
+    assert (clone / "outputs/nearest/metrics.json").is_file()
+
+
 def test_a_data_set_can_be_a_plugin(clone):
     """What happens without `plugins=` is tested in commands/test_plugins.py."""
     train, evaluate, report = words_of("plugin commands")

@@ -140,7 +140,12 @@ def test_the_root_setting_metric_overrides_model_metric():
         (["model=gcnn3", "neighbourhood.rays=15"], "neighbourhood.rays must be even, got 15"),
         (["model=gcnn3", "neighbourhood.radius=0"], "neighbourhood.radius must be above 0, got 0"),
         (["model=gcnn3", "neighbourhood.weights=flat"], "must be one of interpolation, gaussian"),
-        (["neighbourhood=null"], "Config group override must be a string or a list"),
+        (["neighbourhood=null"], "neighbourhood=null: a config group must be one of its options"),
+        (["model=gcnn"], "Could not find 'model/gcnn'; did you mean gcnn3?"),
+        (
+            ["neighbourhood.seq_len=5"],
+            "neighbourhood.seq_len must be seq_len, 20, got 5; set seq_len=5",
+        ),
         (["model=gcnn3", "+neighbourhood.sectors=8"], "unknown key neighbourhood.sectors"),
         (["optim.betas=[2,3]"], "optim.betas must be two numbers in 0..1"),
         (["optim.betas=[0.9]"], "optim.betas must be two numbers in 0..1"),

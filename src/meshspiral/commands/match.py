@@ -51,9 +51,9 @@ def main(config: MatchConfig) -> None:
 
 def match_one(config: MatchConfig) -> Path:
     """Match one mesh; returns the folder of the results."""
+    from meshspiral.data.scans import open_scan
     from meshspiral.matching.job import MatchJob
-    from meshspiral.matching.pair import match_file
-    from meshspiral.matching.writing import remark_lines, write_target
+    from meshspiral.matching.writing import remark_lines, write_match, write_target
 
     if Path(config.source).is_dir():
         raise DataError(
@@ -66,12 +66,14 @@ def match_one(config: MatchConfig) -> Path:
     folder = Path(config.output or Path("outputs", "matches", legal_name(name)))
     job = MatchJob(config, render=config.picture is not False)
     began = time.perf_counter()
+    scan = open_scan(config.source, config.repair)  # its errors come before any work
     meshes = 2 if config.target else 1
     with tqdm(total=meshes, desc="Matching", unit="mesh", leave=False, delay=1.0) as progress:
         if config.target:
             job.prepare()
             progress.update()
-        match = match_file(job, config.source, folder)
+        match = job.label(config.source, scan)
+        write_match(job, match, folder)
     if config.target:
         write_target(job, folder)
     for line in remark_lines(match):

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+from collections.abc import Iterator
 from pathlib import Path
 
 from hydra import compose, initialize_config_dir
@@ -15,30 +17,32 @@ PACKAGE = Path(__file__).parents[1]
 CONF = str(next(p for p in (PACKAGE.parents[1] / "conf", PACKAGE / "conf") if p.is_dir()))
 
 
-def known_keys(command: str) -> list[str]:
-    """What can stand before = on the command line of a command: settings and config groups."""
+@contextlib.contextmanager
+def _fresh_hydra() -> Iterator[None]:
+    """Compose without the state of a command that is running."""
     before = GlobalHydra.instance().hydra
     GlobalHydra.instance().clear()
     try:
         with initialize_config_dir(CONF, version_base="1.3"):
-            tree = OmegaConf.to_container(compose(command))
+            yield
     finally:
         GlobalHydra.instance().hydra = before
+
+
+def known_keys(command: str) -> list[str]:
+    """What can stand before = on the command line of a command: settings and config groups."""
+    with _fresh_hydra():
+        tree = OmegaConf.to_container(compose(command))
     groups = {"experiment"} if command == "train" else set()
     return sorted({*flat(tree), *tree, *groups})
 
 
 def compose_train(overrides: list[str]) -> TrainConfig:
-    """The config that `train` composes from key=value words.
+    """The config that `train` composes from key=value words, for use in Python.
 
     Raises:
         ConfigError: A setting cannot be used.
         HydraException: A word cannot be parsed, or names no option.
     """
-    before = GlobalHydra.instance().hydra  # of the command that calls this
-    GlobalHydra.instance().clear()
-    try:
-        with initialize_config_dir(CONF, version_base="1.3"):
-            return read_config(TrainConfig, compose("train", overrides))
-    finally:
-        GlobalHydra.instance().hydra = before
+    with _fresh_hydra():
+        return read_config(TrainConfig, compose("train", overrides))

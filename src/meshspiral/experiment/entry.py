@@ -92,7 +92,9 @@ def entry_point(
                     sys.exit(2 if isinstance(error, HydraException) else 1)
                 except Exception as error:
                     if "Config group override" in str(error):  # Hydra's, for model=null
-                        print(f"error: {error}", file=sys.stderr)
+                        words = [word for word in sys.argv[1:] if word.endswith("=null")]
+                        message = f"{' '.join(words)}: a config group must be one of its options"
+                        print(f"error: {message}; --help lists them", file=sys.stderr)
                         sys.exit(2)
                     if call.sweep is None:
                         raise
@@ -167,10 +169,14 @@ def one_line(error: BaseException) -> str:
         lines = [line.strip() for line in str(error).splitlines() if line.strip()]
         for i, line in enumerate(lines):
             if line.startswith("Available options in"):
-                options = itertools.takewhile(lambda x: "search path" not in x, lines[i + 1 :])
+                rest = itertools.takewhile(lambda x: "search path" not in x, lines[i + 1 :])
+                options = list(rest)
                 extra = "; others need pip install hydra-joblib-launcher hydra-submitit-launcher"
                 hint = extra if "hydra/launcher" in lines[0] else ""
-                return f"{lines[0]}; there are: {', '.join(options)}{hint}"
+                missing = lines[0].rstrip("'").rpartition("/")[2]
+                close = difflib.get_close_matches(missing, options, n=1)
+                which = f"did you mean {close[0]}? There are" if close else "there are"
+                return f"{lines[0]}; {which}: {', '.join(options)}{hint}"
         if lines[0].startswith(("mismatched input", "token recognition", "no viable")):
             hint = "; a value with = or spaces needs quotes of its own: \"source='a b=c.ply'\""
             return lines[0] + hint

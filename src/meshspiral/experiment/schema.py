@@ -1,8 +1,8 @@
 """The settings of all commands: their types, ranges, choices and help texts.
 
-Default values stand in conf/, and nowhere else. A network, a neighbourhood and a data set declare
-their own settings, in their class's `Settings`. These classes import torch, which takes seconds, so
-they are imported when a config that names them is read.
+Default values of settings stand in conf/, and nowhere else. A network, a neighbourhood and a data
+set declare their own settings, in their class's `Settings`. These classes import torch, which takes
+seconds, so they are imported when a config that names them is read.
 """
 
 from __future__ import annotations
@@ -115,6 +115,12 @@ class TrainConfig(Settings):
                 f"({', '.join(fitting)}), got neighbourhood {around.name}"
             )
         network.check(around)
+        seq_len = getattr(self.neighbourhood, "seq_len", self.seq_len)
+        if seq_len != self.seq_len:
+            raise ValueError(
+                f"neighbourhood.seq_len must be seq_len, {self.seq_len}, got {seq_len}; set "
+                f"seq_len={seq_len}"
+            )
         if self.trainer.val_every > self.optim.epochs:
             raise ValueError(
                 f"trainer.val_every must be at most optim.epochs ({self.optim.epochs}), "

@@ -28,7 +28,7 @@ class Neighbourhood(ABC):
     Class attributes:
         registered: All neighbourhoods, by name.
         gives: Name of the batch entry that networks read; a network fits if its `reads` equals it.
-        noun: What the tables hold, in the plural, for messages.
+        noun: What the tables hold, in the plural, for messages; by default the name.
         modules: Modules whose source code is part of the cache key, beside the class's own.
         random: Whether `draw` makes random choices.
         density_range: Meshes with up to this many times more or fewer vertices than the training
@@ -41,7 +41,7 @@ class Neighbourhood(ABC):
     noun: ClassVar[str]
     modules: ClassVar[tuple[ModuleType, ...]] = ()
     random: ClassVar[bool] = False
-    density_range: ClassVar[float] = 1.5
+    density_range: ClassVar[float] = 1.5  # for tables that grow with the edges, as spirals do
 
     class Settings(BaseModel, extra="forbid", strict=True, frozen=True):
         """The config group `neighbourhood`."""
@@ -52,6 +52,7 @@ class Neighbourhood(ABC):
         super().__init_subclass__(**options)
         if name is not None:
             cls.name = name
+            cls.noun = getattr(cls, "noun", name)
             Neighbourhood.registered[name] = cls
 
     def __init__(self, settings: Any):
@@ -83,11 +84,27 @@ class Neighbourhood(ABC):
 
     @abstractmethod
     def compute(self, mesh: Mesh) -> Arrays:
-        """The arrays to cache."""
+        """The arrays to cache.
+
+        Args:
+            mesh: The surface.
+
+        Returns:
+            NumPy arrays by name, of any shapes and dtypes.
+        """
 
     @abstractmethod
     def tensors(self, arrays: Arrays, mesh: Mesh) -> dict[str, Any]:
-        """The batch entries of a mesh, from its arrays."""
+        """The batch entries of a mesh.
+
+        Args:
+            arrays: What `compute` returned for it.
+            mesh: The surface.
+
+        Returns:
+            Tensors by name, or dictionaries of tensors. If `draw` is not overridden, the entry
+            `gives` is among them.
+        """
 
     def draw(self, batch: Batch, generator: torch.Generator) -> Batch:
         """The batch with the entry `gives`, in which random choices come from `generator`.

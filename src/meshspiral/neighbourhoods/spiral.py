@@ -22,7 +22,6 @@ class Spiral(Neighbourhood, name="spiral"):
     gives, noun = "spirals", "spirals"
     modules = (connectivity, spirals)
     random = True
-    density_range = 1.5  # spirals grow with the edges
 
     class Settings(Neighbourhood.Settings):
         seq_len: int = Field(ge=1, description="number of vertices N of a spiral")

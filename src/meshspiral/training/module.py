@@ -88,7 +88,7 @@ class Correspondence(L.LightningModule):
             raise RunError(
                 f"training diverged: the loss must be finite, got {float(loss)} in epoch "
                 f"{self.current_epoch + 1}, step {batch_idx + 1}, at learning rate {rate:.3g}; try "
-                f"a smaller optim.lr (it is {self.optim.lr:g}). The checkpoints are from before"
+                f"a smaller optim.lr (it is {self.optim.lr:g}). Saved checkpoints are not affected"
             )
 
     def validation_step(self, batch: Batch, batch_idx: int) -> None:

@@ -128,10 +128,11 @@ def description_lines(
     around = Neighbourhood.of(config.neighbourhood).title
     if (metric := getattr(config.model, "metric", None)) is not None:
         around += f" {'with' if metric else 'without'} metric information"
-    threads = torch.get_num_threads()
+    threads, epochs = torch.get_num_threads(), config.optim.epochs
     yield (
-        f"{config.model.name}: {parameters:,} parameters, {around}; {config.optim.epochs} epochs, "
-        f"{precision} on {config.trainer.accelerator}, {threads} thread{'s' * (threads > 1)}"
+        f"{config.model.name}: {parameters:,} parameters, {around}; "
+        f"{epochs} epoch{'s' * (epochs > 1)}, {precision} on {config.trainer.accelerator}, "
+        f"{threads} thread{'s' * (threads > 1)}"
     )
     megabytes = data.cache.size() / 1e6
     yield f"cache: {data.cache.root}, {megabytes:.0f} MB; ready after {seconds:.1f} s"

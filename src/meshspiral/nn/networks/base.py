@@ -23,7 +23,8 @@ class Network(nn.Module):
     """FC16, three layers on neighbourhoods, FC256, FC(num_classes); ReLU after all but the last.
 
     A subclass registers under a name, `class FCSNet(SpiralNet, name="fcs")`, and implements
-    `layer`, `build` and `embed_batch`.
+    `layer` and `embed_batch`. It overrides `options` to use settings of its neighbourhood, and
+    `check` to refuse some.
 
     Class attributes:
         registered: All networks, by name.

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 from pydantic import Field
 from torch import Tensor, nn
@@ -11,7 +11,7 @@ from torch import Tensor, nn
 from meshspiral.nn.layers import metric_features
 from meshspiral.nn.networks.base import Network
 
-METRIC_LAYERS = ("all", "first")
+MetricLayers = Literal["all", "first"]
 
 
 class SpiralNet(Network):
@@ -34,7 +34,7 @@ class SpiralNet(Network):
 
     class Settings(Network.Settings):
         metric: bool = Field(description="read metric information: distance and angle")
-        metric_layers: Literal["all", "first"] = Field(
+        metric_layers: MetricLayers = Field(
             description="spiral layers that read metric information: all, or the first alone"
         )
 
@@ -48,8 +48,8 @@ class SpiralNet(Network):
         dropout: float,
         feature_scale: float,
     ):
-        if metric_layers not in METRIC_LAYERS:
-            raise ValueError(f"metric_layers must be one of {METRIC_LAYERS}, got {metric_layers!r}")
+        if metric_layers not in (choices := get_args(MetricLayers)):
+            raise ValueError(f"metric_layers must be one of {choices}, got {metric_layers!r}")
         self.metric, self.metric_layers = metric, metric_layers
         super().__init__(in_features, num_classes, channels, dropout, feature_scale)
 
@@ -58,8 +58,17 @@ class SpiralNet(Network):
         return self.spiral_layer(in_features, out_features, takes_metric)
 
     def spiral_layer(self, in_features: int, out_features: int, metric: bool) -> nn.Module:
-        """A layer that takes features [V, in_features], spirals [V, N] and metric information
-        [V, N, 2] or None, and returns [V, out_features]."""
+        """One of the three layers.
+
+        Args:
+            in_features: Number of input channels.
+            out_features: Number of output channels.
+            metric: Whether the layer reads metric information.
+
+        Returns:
+            A module that takes features [V, in_features], spirals [V, N] and metric information
+            [V, N, 2] or None, and returns [V, out_features].
+        """
         raise NotImplementedError
 
     def embed_batch(self, batch: Mapping[str, Any]) -> Tensor:
