@@ -154,9 +154,10 @@ def test_a_sweep_with_a_stopped_job_has_not_succeeded(tmp_path):
 
 @pytest.mark.parametrize("launcher", ["joblib", "submitit_local"])
 def test_launchers_run_jobs_in_separate_processes(toy_overrides, tmp_path, launcher):
-    """Two jobs share the cache and the cores; one fails."""
+    """Two jobs share the cache and the cores; one fails, and the other renders."""
     toy = [o for o in toy_overrides if not o.startswith(("trainer.threads", "optim"))]
     command = ["-m", f"hydra/launcher={launcher}", "optim.lr=0,0.01", *toy, *QUICK]
+    command = [word.replace("picture=false", "picture=true") for word in command]
     env = {k: v for k, v in os.environ.items() if not k.endswith("_NUM_THREADS")}
     done = subprocess.run(
         [sys.executable, "-m", "src.train", *command],
@@ -177,6 +178,7 @@ def test_launchers_run_jobs_in_separate_processes(toy_overrides, tmp_path, launc
         "optim.lr-0.01": "finished",
     }
     assert "optim.lr must be above 0" in done.stdout
+    assert (sweep / "optim.lr-0.01" / "correspondence.png").is_file()
     alone = tmp_path / "alone"
     run(alone, [*toy, *QUICK, "optim.lr=0.01", "trainer.threads=1"])
     trained, expected = weights(sweep / "optim.lr-0.01"), weights(alone)
