@@ -450,8 +450,6 @@ RULES = {
     "less_than": "must be below {lt:.10g}",
     "finite_number": "must be a finite number",
     "literal_error": "must be one of {choices}",
-    "too_short": "must have at least {min_length} values",
-    "too_long": "must have at most {max_length} values",
 }
 
 

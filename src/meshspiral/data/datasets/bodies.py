@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Literal
+from typing import Literal, get_args
 
 import numpy as np
 from pydantic import Field
@@ -12,7 +12,7 @@ from meshspiral.data.settings import DataSettings
 from meshspiral.data.shapes import DataError, Shape, ShapeSet, registered_shape, subject_split
 from meshspiral.geometry.mesh import Mesh
 
-SIZES = (1500, 6890)
+Size = Literal[1500, 6890]
 
 
 class Bodies(ShapeSet, name="bodies"):
@@ -32,10 +32,10 @@ class Bodies(ShapeSet, name="bodies"):
     up = "z"
 
     class Settings(DataSettings):
-        vertices: Literal[1500, 6890] = Field(description="vertices of the template and the bodies")
+        vertices: Size = Field(description="vertices of the template and the bodies")
 
     def __init__(self, vertices: int = 1500) -> None:
-        if vertices not in SIZES:
+        if vertices not in get_args(Size):
             raise DataError(f"vertices must be 1500 or 6890, got {vertices!r}")
         path = Path(__file__).parents[1] / "assets" / f"bodies_{int(vertices)}.npz"
         with np.load(path, allow_pickle=False) as file:

@@ -6,7 +6,7 @@ import logging
 import re
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Literal
+from typing import Literal, get_args
 
 from pydantic import Field
 
@@ -19,7 +19,7 @@ from meshspiral.geometry.mesh import Mesh
 
 log = logging.getLogger(__name__)
 
-POLICIES = ("iso", "qes", "mc", "dense")
+Policy = Literal["iso", "qes", "mc", "dense"]
 _HELP = (
     "The benchmark (remeshed test shapes of FAUST) is public: git clone "
     "https://github.com/nmwsharp/discretization-robust-correspondence-benchmark and set "
@@ -55,9 +55,7 @@ class FaustBenchmark(ShapeSet, name="faust_benchmark"):
         benchmark_root: Text | None = Field(
             description="the benchmark's repository or its data folder"
         )
-        policy: Literal["iso", "qes", "mc", "dense"] = Field(
-            description="how the test meshes were remeshed"
-        )
+        policy: Policy = Field(description="how the test meshes were remeshed")
         train: list[Text] | None = Field(
             description="meshes of the benchmark to train on, names or patterns; null: FAUST's "
             "registrations of subjects 0 to 6"
@@ -70,8 +68,8 @@ class FaustBenchmark(ShapeSet, name="faust_benchmark"):
         policy: str = "iso",
         train: str | Sequence[str] | None = None,
     ) -> None:
-        if policy not in POLICIES:
-            raise DataError(f"policy must be one of {', '.join(POLICIES)}, got {policy!r}")
+        if policy not in get_args(Policy):
+            raise DataError(f"policy must be one of {', '.join(get_args(Policy))}, got {policy!r}")
         self._faust = Faust(root)
         data = _data_folder(benchmark_root, policy)
         names = [f"tr_reg_{policy}_{i:03d}" for i in range(80, 100)]
