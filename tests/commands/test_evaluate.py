@@ -13,6 +13,8 @@ import torch
 from meshspiral.commands.evaluate import main
 from meshspiral.data.cache import Cache
 from meshspiral.data.datamodule import CorrespondenceData
+from meshspiral.data.descriptors import Features
+from meshspiral.data.descriptors.shot import Shot
 from meshspiral.data.settings import ShotSettings
 from meshspiral.data.shapes import DataError, Shape, ShapeSet, SurfacePoints
 from meshspiral.evaluation.metrics import THRESHOLDS, point_errors
@@ -312,8 +314,10 @@ class LabelledWithPoints(ShapeSet):
 def point_data(tmp_path):
     spirals = Neighbourhood.registered["spiral"]
     neighbourhood = spirals(spirals.Settings(name="spiral", seq_len=8, rings=None))
-    shot = ShotSettings(radius=0.3, bins=4)
-    return CorrespondenceData(LabelledWithPoints(), shot, neighbourhood, Cache(tmp_path), workers=1)
+    features = Features((Shot(ShotSettings(radius=0.3, bins=4)),), 0.3)
+    return CorrespondenceData(
+        LabelledWithPoints(), features, neighbourhood, Cache(tmp_path), workers=1
+    )
 
 
 @pytest.mark.parametrize("shuffled", [False, True])

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from meshspiral.data.cache import Cache, CacheError, code_version, digest
+from meshspiral.data.descriptors.shot import Shot
 from meshspiral.data.preprocessing import Task, descriptor_task, neighbourhood_task, run_tasks
 from meshspiral.data.settings import ShotSettings
 from tests.meshes import bumpy_sphere
@@ -176,7 +177,7 @@ def test_two_processes_can_write_the_same_key(cache, caplog):
 
 
 def tasks():
-    shot = ShotSettings(radius=0.3, bins=4)
+    shot = Shot(ShotSettings(radius=0.3, bins=4))
     spheres = [bumpy_sphere(seed, subdivisions=3) for seed in range(4)]
     return [
         task

@@ -12,6 +12,9 @@ import torch
 from meshspiral.data import preprocessing
 from meshspiral.data.cache import Cache
 from meshspiral.data.datamodule import CorrespondenceData, EpochSampler
+from meshspiral.data.descriptors import Features
+from meshspiral.data.descriptors.raw import Raw
+from meshspiral.data.descriptors.shot import Shot
 from meshspiral.data.pool import run_in_pool
 from meshspiral.data.preprocessing import (
     descriptor_task,
@@ -26,9 +29,11 @@ from meshspiral.neighbourhoods.spiral import Spiral
 from meshspiral.nn.layers import metric_features
 from tests.conftest import TOY_SPLIT, toy_shapes
 from tests.meshes import bumpy_sphere, lattice
-from tests.neighbourhoods.made import patch, spiral
+from tests.neighbourhoods.made import patch, sampled, spiral
 
-SHOT = ShotSettings(radius=0.3, bins=4)
+SHOT = Shot(ShotSettings(radius=0.3, bins=4))
+RAW = {"radius": 0.5, "rings": 2, "rays": 4, "support": 0.8}
+FEATURES = Features((SHOT,), unit=0.3)
 
 
 class Toy(ShapeSet):
@@ -44,7 +49,9 @@ class Toy(ShapeSet):
 
 def prepared(cache, neighbourhood=None, seed=0, shapes=None, **options):
     neighbourhood = neighbourhood or spiral(8)
-    data = CorrespondenceData(Toy(shapes), SHOT, neighbourhood, cache, seed, workers=1, **options)
+    data = CorrespondenceData(
+        Toy(shapes), FEATURES, neighbourhood, cache, seed, workers=1, **options
+    )
     data.prepare()
     return data
 
@@ -190,19 +197,24 @@ def test_every_mesh_has_its_own_reproducible_permutation(cache):
 
 def test_a_second_run_computes_nothing(cache, monkeypatch):
     prepared(cache)
-    monkeypatch.setattr(preprocessing, "_descriptors", None)
+    monkeypatch.setattr(Shot, "compute", None)
     monkeypatch.setattr(Spiral, "compute", None)
     prepared(cache)
 
 
 def test_cache_keys_depend_on_every_parameter():
     mesh = bumpy_sphere()
-    settings = [SHOT, ShotSettings(radius=0.31, bins=4), ShotSettings(radius=0.3, bins=5)]
-    assert len({descriptor_task(mesh, each).key for each in settings}) == 3
+    settings = [{"radius": 0.3, "bins": 4}, {"radius": 0.31, "bins": 4}, {"radius": 0.3, "bins": 5}]
+    descriptors = [Shot(ShotSettings(**each)) for each in settings]
+    descriptors += [Raw(Raw.Settings(**{**RAW, key: RAW[key] + 1})) for key in RAW]
+    assert len({descriptor_task(mesh, each).key for each in descriptors}) == 3 + len(RAW)
     neighbourhoods = [spiral(8), spiral(9), spiral(8, rings=1), spiral(8, rings=2)]
     neighbourhoods += [patch(), patch(radius=0.11), patch(rings=4), patch(rays=16)]
-    neighbourhoods += [patch(weights="gaussian")]
-    assert len({neighbourhood_task(mesh, each).key for each in neighbourhoods}) == 9
+    neighbourhoods += [patch(weights="gaussian"), spiral(8, dilation=2), spiral(8, start="frame")]
+    changes = [{}, {"rings": 4}, {"rays": 6}, {"radius": 0.5}, {"radius": [0.5, 0.5, 1.0]}]
+    changes += [{"blend": True}, {"relative_to": "diameter"}, {"start": "random"}, {"support": 0.5}]
+    neighbourhoods += [sampled(**change) for change in changes]
+    assert len({neighbourhood_task(mesh, each).key for each in neighbourhoods}) == 20
 
 
 def test_cache_keys_depend_on_content_and_code_but_not_on_the_name(monkeypatch):
@@ -254,7 +266,7 @@ def test_the_pool_gives_the_results_of_one_process(tmp_path, monkeypatch):
     alone = prepared(Cache(tmp_path / "alone"))
     clock = iter(range(0, 10**6, 100))  # all tasks seem slow
     monkeypatch.setattr(preprocessing.time, "perf_counter", lambda: next(clock))
-    data = CorrespondenceData(Toy(), SHOT, spiral(8), Cache(tmp_path / "pool"), workers=2)
+    data = CorrespondenceData(Toy(), FEATURES, spiral(8), Cache(tmp_path / "pool"), workers=2)
     started = []
     run_in_pool = preprocessing.run_in_pool
 

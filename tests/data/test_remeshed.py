@@ -96,7 +96,8 @@ def test_the_ground_truth_is_the_point_at_the_vertex(toys):
 
 @pytest.mark.parametrize("template, size", [(6890, 5000), (1500, 1100), (162, 118), (10, 12)])
 def test_the_usual_size(template, size):
-    assert usual_size(template) == size
+    usual = usual_size(template)
+    assert usual == size and isinstance(usual, int)  # PyMeshLab takes no 1100.0
 
 
 def test_another_policy_or_size_is_another_mesh(toys, tmp_path):

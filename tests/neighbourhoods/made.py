@@ -3,11 +3,21 @@
 from __future__ import annotations
 
 from meshspiral.neighbourhoods.patch import Patch
+from meshspiral.neighbourhoods.sampled import Sampled
 from meshspiral.neighbourhoods.spiral import Spiral
 
+STARTS = {"start": "random", "support": 0.8, "jitter": 0}
 
-def spiral(seq_len: int, rings: int | None = None) -> Spiral:
-    return Spiral(Spiral.Settings(name="spiral", seq_len=seq_len, rings=rings))
+
+def spiral(seq_len: int, rings: int | None = None, dilation=1, **starts) -> Spiral:
+    settings = {"seq_len": seq_len, "rings": rings, "dilation": dilation} | STARTS | starts
+    return Spiral(Spiral.Settings(name="spiral", **settings))
+
+
+def sampled(radius=0.4, rings=2, rays=5, blend=False, relative_to="area", **starts) -> Sampled:
+    grid = {"radius": radius, "rings": rings, "rays": rays, "relative_to": relative_to}
+    settings = grid | {"blend": blend} | STARTS | {"start": "frame"} | starts
+    return Sampled(Sampled.Settings(name="sampled", **settings))
 
 
 def patch(radius=0.1, rings=3, rays=8, weights="interpolation") -> Patch:

@@ -6,14 +6,15 @@ import numpy as np
 import torch
 from lightning.fabric.utilities import move_data_to_device
 
-from meshspiral.data.datamodule import described_tensors
-from meshspiral.data.preprocessing import descriptor_task, neighbourhood_task
+from meshspiral.data.datamodule import described_tensors, mesh_tensors, neighbourhood_tensors
+from meshspiral.data.descriptors import Features
+from meshspiral.data.preprocessing import compute_task, neighbourhood_task
 from meshspiral.data.shapes import Shape
 from meshspiral.data.sources import open_shapes
 from meshspiral.experiment.schema import TrainConfig
 from meshspiral.geometry.mesh import Mesh
 from meshspiral.neighbourhoods import Neighbourhood
-from meshspiral.neighbourhoods.base import Arrays, Batch
+from meshspiral.neighbourhoods.base import Batch
 from meshspiral.nn.networks import Network
 from meshspiral.training.module import build_network
 
@@ -24,8 +25,8 @@ def network_of(config: TrainConfig, num_classes: int) -> Network:
 
 
 def channels(config: TrainConfig) -> int:
-    """Number of channels of the descriptor."""
-    return 32 * (config.data.shot.bins + 1)
+    """Number of channels of the descriptors."""
+    return Features.of(config.data).channels
 
 
 def first_body(config: TrainConfig) -> Shape:
@@ -37,9 +38,9 @@ def first_body(config: TrainConfig) -> Shape:
 def body_batch(config: TrainConfig, device: str) -> Batch:
     """The batch of the first training shape, as in training, with nothing drawn yet."""
     shape = first_body(config)
-    task = descriptor_task(shape.mesh, config.data.shot)
-    labels = torch.from_numpy(shape.labels)
-    batch = _batch(config, shape.mesh, task.compute(*task.arguments), labels)
+    neighbourhood = Neighbourhood.of(config.neighbourhood)
+    batch = mesh_tensors(shape.mesh, Features.of(config.data), neighbourhood)
+    batch |= {"labels": torch.from_numpy(shape.labels), "index": 0}
     return move_data_to_device(batch, device)
 
 
@@ -57,15 +58,11 @@ def torus_batch(config: TrainConfig, vertices: int, num_classes: int) -> Batch:
     features = rng.standard_normal((vertices, channels(config)), dtype=np.float32)
     features /= channels(config) ** 0.5  # of length 1, as SHOT
     labels = torch.from_numpy(rng.integers(num_classes, size=vertices))
-    return _batch(config, torus(vertices), {"features": features}, labels)
-
-
-def _batch(config: TrainConfig, mesh: Mesh, described: Arrays, labels: torch.Tensor) -> Batch:
-    neighbourhood = Neighbourhood.of(config.neighbourhood)
-    task = neighbourhood_task(mesh, neighbourhood)
+    mesh, neighbourhood = torus(vertices), Neighbourhood.of(config.neighbourhood)
+    arrays = compute_task(neighbourhood_task(mesh, neighbourhood))
     return {
-        **described_tensors(described, mesh, config.data.shot),
-        **neighbourhood.tensors(task.compute(*task.arguments), mesh),
+        **described_tensors([{"features": features}], mesh, Features.of(config.data)),
+        **neighbourhood_tensors(mesh, neighbourhood, arrays),
         "labels": labels,
         "index": 0,
     }

@@ -10,7 +10,14 @@ from functools import partial
 from meshspiral.benchmarking.inputs import first_body
 from meshspiral.benchmarking.measure import Row, medians
 from meshspiral.data.cache import Cache
-from meshspiral.data.preprocessing import Task, descriptor_task, neighbourhood_task, run_tasks
+from meshspiral.data.descriptors import Features
+from meshspiral.data.preprocessing import (
+    Task,
+    compute_task,
+    descriptor_task,
+    neighbourhood_task,
+    run_tasks,
+)
 from meshspiral.data.sources import open_shapes
 from meshspiral.experiment.schema import BenchmarkConfig, TrainConfig
 from meshspiral.geometry.mesh import Mesh
@@ -23,14 +30,15 @@ def preprocessing_rows(config: BenchmarkConfig, networks: list[TrainConfig]) -> 
     The last row is everything for all bodies, with all cores, from an empty cache.
     """
     data, makers = networks[0].data, dict[str, Callable[[Mesh], Task]]()
-    makers["shot"] = partial(descriptor_task, settings=data.shot)
+    for descriptor in Features.of(data).descriptors:
+        makers[descriptor.name] = partial(descriptor_task, descriptor=descriptor)
     for network in networks:
         around = Neighbourhood.of(network.neighbourhood)
         makers[around.title] = partial(neighbourhood_task, neighbourhood=around)
     mesh = first_body(networks[0]).mesh
     tasks = {name: make(mesh) for name, make in makers.items()}
     seconds = medians(
-        {name: partial(task.compute, *task.arguments) for name, task in tasks.items()},
+        {name: partial(compute_task, task) for name, task in tasks.items()},
         config.repeats,
     )
     rows: list[Row] = [{"what": name, "meshes": 1, "seconds": s} for name, s in seconds.items()]

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterator
+from collections import Counter
+from collections.abc import Iterator, Sequence
 from functools import cached_property
 from itertools import chain
 
@@ -14,14 +15,16 @@ from torch.utils.data import DataLoader, Dataset, Sampler
 from tqdm import tqdm
 
 from meshspiral.data.cache import Arrays, Cache
+from meshspiral.data.descriptors import Features
 from meshspiral.data.preprocessing import (
+    compute_task,
     descriptor_task,
+    frame_task,
     load_task,
     neighbourhood_task,
     run_tasks,
 )
 from meshspiral.data.reference import ReferenceDistances
-from meshspiral.data.settings import ShotSettings
 from meshspiral.data.shapes import SPLITS, DataError, Shape, ShapeSet
 from meshspiral.geometry.digest import derived_seed
 from meshspiral.geometry.mesh import Mesh
@@ -31,33 +34,64 @@ from meshspiral.neighbourhoods.base import Batch
 log = logging.getLogger(__name__)
 
 
-def draw(neighbourhood: Neighbourhood, batch: Batch, *purpose: int | str) -> Batch:
+def draw(
+    neighbourhood: Neighbourhood, batch: Batch, *purpose: int | str, training: bool = False
+) -> Batch:
     """The batch with the neighbourhoods drawn, by chance that depends on (purpose, mesh) alone.
 
     Args:
         neighbourhood: Whose tensors the batch holds.
         batch: An item of `MeshDataset`, on any device.
         *purpose: For instance the seed and the epoch.
+        training: Whether the batch is trained on.
     """
     generator = torch.Generator(batch["features"].device)
     generator.manual_seed(derived_seed(*purpose, batch["index"]))
-    return neighbourhood.draw(batch, generator)
+    return neighbourhood.draw(batch, generator, training)
 
 
-def described_tensors(arrays: Arrays, mesh: Mesh, settings: ShotSettings) -> Batch:
+def described_tensors(arrays: Sequence[Arrays], mesh: Mesh, features: Features) -> Batch:
     """`features`, `vertices` and `unit` of `MeshDataset`.
 
     Args:
-        arrays: The result of a `descriptor_task`.
+        arrays: The result of the `descriptor_task` of each descriptor.
         mesh: The mesh that was described.
-        settings: The settings of that task.
+        features: The descriptors.
     """
-    centred = mesh.vertices - mesh.vertices.mean(axis=0)  # float32 has no digits left far away
+    columns = [torch.from_numpy(described["features"]) for described in arrays]
     return {
-        "features": torch.from_numpy(arrays["features"]),
-        "vertices": torch.from_numpy(centred.astype(np.float32)),
-        "unit": torch.tensor(settings.radius * np.sqrt(mesh.area), dtype=torch.float32),
+        "features": columns[0] if len(columns) == 1 else torch.cat(columns, dim=1),
+        "vertices": torch.from_numpy(mesh.centred.astype(np.float32)),
+        "unit": torch.tensor(features.unit * np.sqrt(mesh.area), dtype=torch.float32),
     }
+
+
+def mesh_tensors(mesh: Mesh, features: Features, neighbourhood: Neighbourhood) -> Batch:
+    """All entries of `MeshDataset` but the labels, for one mesh, without the cache."""
+    tasks = [descriptor_task(mesh, descriptor) for descriptor in features.descriptors]
+    described = [compute_task(task) for task in tasks]
+    arrays = compute_task(neighbourhood_task(mesh, neighbourhood))
+    batch = described_tensors(described, mesh, features)
+    return batch | neighbourhood_tensors(mesh, neighbourhood, arrays)
+
+
+def neighbourhood_tensors(
+    mesh: Mesh, neighbourhood: Neighbourhood, arrays: Arrays, cache: Cache | None = None
+) -> Batch:
+    """The tensors of a neighbourhood for one mesh.
+
+    Args:
+        mesh: The surface.
+        neighbourhood: Whose `tensors` are wanted.
+        arrays: The result of its `neighbourhood_task`.
+        cache: Where local frames are read from, or computed into; None for no cache.
+    """
+    support = neighbourhood.frame_support
+    if support is None:
+        return neighbourhood.tensors(arrays, mesh)
+    task = frame_task(mesh, support)
+    frames = compute_task(task) if cache is None else load_task(task, cache)
+    return neighbourhood.tensors(arrays, mesh, frames["frames"])
 
 
 class MeshDataset(Dataset):
@@ -127,7 +161,7 @@ class CorrespondenceData(L.LightningDataModule):
 
     Args:
         shapes: The data set.
-        shot: Settings of the descriptors.
+        features: The descriptors.
         neighbourhood: What the network reads around a vertex.
         cache: Where descriptors, tables and distances are cached.
         seed: Seed of the order of meshes and of all draws.
@@ -138,7 +172,7 @@ class CorrespondenceData(L.LightningDataModule):
     def __init__(
         self,
         shapes: ShapeSet,
-        shot: ShotSettings,
+        features: Features,
         neighbourhood: Neighbourhood,
         cache: Cache,
         seed: int = 0,
@@ -146,7 +180,8 @@ class CorrespondenceData(L.LightningDataModule):
         workers: int | None = None,
     ):
         super().__init__()
-        self.shapes, self.shot, self.neighbourhood, self.cache = shapes, shot, neighbourhood, cache
+        self.shapes, self.features = shapes, features
+        self.neighbourhood, self.cache = neighbourhood, cache
         self.seed, self.shuffle_vertices, self.workers = seed, shuffle_vertices, workers
         self.datasets: dict[str, MeshDataset] = {}
         self._skip = 0
@@ -163,8 +198,8 @@ class CorrespondenceData(L.LightningDataModule):
 
     @property
     def in_features(self) -> int:
-        """Number of channels of the descriptor."""
-        return 32 * (self.shot.bins + 1)
+        """Number of channels of the descriptors."""
+        return self.features.channels
 
     @cached_property
     def reference(self) -> ReferenceDistances:
@@ -200,13 +235,14 @@ class CorrespondenceData(L.LightningDataModule):
         shapes, tasks = [], []
         for _, name in tqdm(names, desc="Meshes", unit="mesh", delay=1.0):
             shape = self.shape(name)
-            self._check_length(name, len(shape.labels))
+            self._check_size(name, len(shape.labels))
             shapes.append(shape)
-            descriptors = descriptor_task(shape.mesh, self.shot)
-            tasks.append((descriptors, neighbourhood_task(shape.mesh, self.neighbourhood)))
+            described = [descriptor_task(shape.mesh, each) for each in self.features.descriptors]
+            tasks.append((*described, neighbourhood_task(shape.mesh, self.neighbourhood)))
         what = f"Descriptors and {self.neighbourhood.noun}"
         run_tasks(chain(*tasks), self.cache, self.workers, what)
-        loaded: dict[str, Batch] = {}  # meshes with equal tables share their tensors
+        repeated = Counter(table.key for *_, table in tasks)
+        loaded: dict[str, Arrays] = {}  # tables of several meshes, which share them
         items: dict[str, list[Batch]] = {split: [] for split in wanted}
         progress = tqdm(
             zip(names, shapes, tasks, strict=True),
@@ -215,20 +251,24 @@ class CorrespondenceData(L.LightningDataModule):
             unit="mesh",
             delay=1.0,
         )
-        for (split, name), shape, (descriptors, table) in progress:
-            if table.key not in loaded:
+        for (split, name), shape, (*descriptors, table) in progress:
+            arrays = loaded.get(table.key)
+            if arrays is None:
                 arrays = load_task(table, self.cache)
-                loaded[table.key] = self.neighbourhood.tensors(arrays, shape.mesh)
-            described = load_task(descriptors, self.cache)
-            if undefined := int(described["undefined"]):
-                log.warning(
-                    "%s: SHOT is undefined at %d of %d vertices; using zeros",
-                    name,
-                    undefined,
-                    len(shape.labels),
-                )
-            item = described_tensors(described, shape.mesh, self.shot)
-            item |= loaded[table.key]
+                if repeated[table.key] > 1:
+                    loaded[table.key] = arrays
+            described = [load_task(task, self.cache) for task in descriptors]
+            for task, result in zip(descriptors, described, strict=True):
+                if undefined := int(result["undefined"]):
+                    log.warning(
+                        "%s: %s is undefined at %d of %d vertices; using zeros",
+                        name,
+                        task.kind.upper(),
+                        undefined,
+                        len(shape.labels),
+                    )
+            item = described_tensors(described, shape.mesh, self.features)
+            item |= neighbourhood_tensors(shape.mesh, self.neighbourhood, arrays, self.cache)
             item["labels"] = torch.from_numpy(shape.labels)
             if shape.points is not None:
                 points = shape.points._asdict()
@@ -237,12 +277,12 @@ class CorrespondenceData(L.LightningDataModule):
         for split in wanted:
             self.datasets[split] = MeshDataset(self.shapes.names[split], items[split])
 
-    def _check_length(self, name: str, vertices: int) -> None:
-        length = self.neighbourhood.length
-        if length is not None and length > vertices:
+    def _check_size(self, name: str, vertices: int) -> None:
+        least = self.neighbourhood.least_vertices
+        if least > vertices:
             raise DataError(
                 f"{name}: {self.neighbourhood.noun} must have at most the {vertices:,} vertices of "
-                f"the mesh, got {length:,}"
+                f"the mesh, got {least:,}"
             )
 
     def train_dataloader(self) -> DataLoader:
@@ -272,9 +312,9 @@ class CorrespondenceData(L.LightningDataModule):
         return (trainer.global_rank, trainer.world_size) if trainer is not None else (0, 1)
 
     def on_after_batch_transfer(self, batch: Batch, dataloader_idx: int) -> Batch:
-        trainer = self.trainer
-        when = f"epoch {trainer.current_epoch}" if trainer.training else "evaluation"
-        return draw(self.neighbourhood, batch, self.seed, "spirals", when)
+        training = self.trainer.training
+        when = f"epoch {self.trainer.current_epoch}" if training else "evaluation"
+        return draw(self.neighbourhood, batch, self.seed, "spirals", when, training=training)
 
     def state_dict(self) -> dict[str, int]:
         progress = self.trainer.fit_loop.epoch_loop.batch_progress.current

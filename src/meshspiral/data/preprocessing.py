@@ -9,15 +9,18 @@ import sys
 import time
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
+from functools import partial
+from types import ModuleType
 
 import numpy as np
 from joblib import cpu_count
 from tqdm import tqdm
 
 from meshspiral.data.cache import Arrays, Cache, code_version
+from meshspiral.data.descriptors import Descriptor
 from meshspiral.data.pool import run_in_pool
-from meshspiral.data.settings import ShotSettings
-from meshspiral.geometry import angles, mesh, shot
+from meshspiral.geometry import mesh as meshes
+from meshspiral.geometry import shot
 from meshspiral.geometry.digest import digest
 from meshspiral.geometry.mesh import Mesh, MeshError
 from meshspiral.neighbourhoods import Neighbourhood
@@ -27,7 +30,10 @@ POOL_START = 6.0  # seconds that starting the worker processes takes
 
 @dataclass(frozen=True, eq=False)
 class Task:
-    """One result: `compute(*arguments)`, cached as `kind` under `key`."""
+    """One result: `compute(*arguments)`, cached as `kind` under `key`.
+
+    An argument that is a task itself is replaced by its result, the first array of it.
+    """
 
     kind: str
     key: str
@@ -35,34 +41,66 @@ class Task:
     arguments: tuple
 
 
-def descriptor_task(mesh_: Mesh, settings: ShotSettings) -> Task:
-    """SHOT descriptors: `features` float32 [V, 32 (bins + 1)], zeros where SHOT is undefined, and
-    `undefined`, the number of such vertices."""
-    version = code_version(angles, mesh, shot, sys.modules[__name__])
-    key = digest(mesh_.vertices, mesh_.faces, settings.radius, settings.bins, version)
-    return Task("shot", key, _descriptors, (mesh_, settings.radius, settings.bins))
+def frame_task(mesh: Mesh, support: float) -> Task:
+    """The local frames of a mesh: `frames` float32 [V, 3, 3], see `local_frames`.
+
+    Args:
+        mesh: The surface.
+        support: Radius of their support over the square root of the surface area.
+    """
+    version = code_version(meshes, shot, sys.modules[__name__])
+    return Task("frames", digest(mesh.vertices, support, version), _frames, (mesh, support))
 
 
-def neighbourhood_task(mesh_: Mesh, neighbourhood: Neighbourhood) -> Task:
+def descriptor_task(mesh: Mesh, descriptor: Descriptor) -> Task:
+    """A descriptor: `features` float32 [V, C], zeros where it is undefined, and `undefined`, the
+    number of such vertices."""
+    key = digest(
+        repr(sorted(descriptor.settings.model_dump().items())),
+        mesh.vertices,
+        mesh.faces,
+        code_version(*descriptor.modules, *_sources(descriptor), meshes, sys.modules[__name__]),
+    )
+    return Task(descriptor.name, key, partial(_described, descriptor), _inputs(descriptor, mesh))
+
+
+def neighbourhood_task(mesh: Mesh, neighbourhood: Neighbourhood) -> Task:
     """The arrays of a neighbourhood, see its `compute`."""
-    classes = [cls for cls in type(neighbourhood).__mro__ if issubclass(cls, Neighbourhood)]
-    sources = [inspect.getmodule(cls) for cls in classes if cls is not Neighbourhood]
-    version = code_version(*neighbourhood.modules, *sources)
+    version = code_version(*neighbourhood.modules, *_sources(neighbourhood))
     settings = sorted(neighbourhood.settings.model_dump().items())
-    key = digest(repr(settings), *neighbourhood.mesh_key(mesh_), version)
-    return Task(neighbourhood.name, key, neighbourhood.compute, (mesh_,))
+    key = digest(repr(settings), *neighbourhood.mesh_key(mesh), version)
+    inputs = _inputs(neighbourhood, mesh)
+    return Task(neighbourhood.name, key, neighbourhood.compute, inputs)
 
 
-def _descriptors(mesh_: Mesh, radius: float, bins: int) -> Arrays:
-    if mesh_.area == 0:
-        raise MeshError(f"{mesh_.name}: surface area must be above 0 to scale descriptors, got 0")
-    length = radius * np.sqrt(mesh_.area)
-    # SHOT is defined in float32, which has no digits left far from the origin
-    centred = mesh_.vertices - mesh_.vertices.mean(axis=0)
-    features = shot.shot_descriptors(centred, mesh_.vertex_normals, length, bins)
+def _sources(described: Descriptor | Neighbourhood) -> list[ModuleType]:
+    """The modules of an object's class and of those that it derives from, without the base."""
+    classes = [cls for cls in type(described).__mro__ if hasattr(cls, "frame_support")]
+    return [inspect.getmodule(cls) for cls in classes[:-1]]
+
+
+def _inputs(described: Descriptor | Neighbourhood, mesh: Mesh) -> tuple:
+    """What its `compute` takes: the mesh, and frames if it needs them."""
+    support = described.frame_support
+    return (mesh,) if support is None else (mesh, frame_task(mesh, support))
+
+
+def _frames(mesh: Mesh, support: float) -> Arrays:
+    _check_area(mesh)
+    return {"frames": shot.local_frames(mesh.centred, support * np.sqrt(mesh.area))}
+
+
+def _described(descriptor: Descriptor, mesh: Mesh, *frames: np.ndarray) -> Arrays:
+    _check_area(mesh)
+    features = descriptor.compute(mesh, *frames)
     undefined = np.isnan(features).any(axis=1)
     features[undefined] = 0.0
     return {"features": features, "undefined": np.array(undefined.sum())}
+
+
+def _check_area(mesh: Mesh) -> None:
+    if mesh.area == 0:
+        raise MeshError(f"{mesh.name}: surface area must be above 0 to scale descriptors, got 0")
 
 
 def run_tasks(tasks: Iterable[Task], cache: Cache, workers: int | None, description: str) -> None:
@@ -104,9 +142,20 @@ def run_tasks(tasks: Iterable[Task], cache: Cache, workers: int | None, descript
 
 def _run(task: Task, cache: Cache) -> None:
     if not cache.has(task.kind, task.key):  # another process may have computed it meanwhile
-        cache.save(task.kind, task.key, task.compute(*task.arguments))
+        cache.save(task.kind, task.key, compute_task(task, cache))
 
 
 def load_task(task: Task, cache: Cache) -> Arrays:
     """The result of a task: from the cache, or computed if it is missing or damaged there."""
-    return cache.get(task.kind, task.key, lambda: task.compute(*task.arguments))
+    return cache.get(task.kind, task.key, lambda: compute_task(task, cache))
+
+
+def compute_task(task: Task, cache: Cache | None = None) -> Arrays:
+    """Compute a task, and those among its arguments; the latter through the cache, if given."""
+    arguments = []
+    for argument in task.arguments:
+        if isinstance(argument, Task):
+            load = compute_task if cache is None else load_task
+            argument = next(iter(load(argument, cache).values()))
+        arguments.append(argument)
+    return task.compute(*arguments)

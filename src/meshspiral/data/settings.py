@@ -16,7 +16,15 @@ def _as_text(value: Any) -> Any:
 Text = Annotated[str, BeforeValidator(_as_text)]
 
 
-class ShotSettings(BaseModel, extra="forbid", strict=True, frozen=True):
+# several names, or a single one
+Names = Annotated[list[str], BeforeValidator(lambda v: [v] if isinstance(v, str) else v)]
+
+
+class Strict(BaseModel, extra="forbid", strict=True, frozen=True):
+    """Settings that accept their declared types alone, and no other keys."""
+
+
+class ShotSettings(Strict):
     """SHOT descriptors."""
 
     radius: float = Field(
@@ -25,7 +33,7 @@ class ShotSettings(BaseModel, extra="forbid", strict=True, frozen=True):
     bins: int = Field(ge=1, description="bins of the cosine; 16 give 544 channels")
 
 
-class RemeshSettings(BaseModel, extra="forbid", strict=True, frozen=True):
+class RemeshSettings(Strict):
     """Another tessellation of every shape."""
 
     policy: Literal["isotropic", "adaptive", "refined", "simplified", "marching", "mixed"] = Field(
@@ -37,11 +45,14 @@ class RemeshSettings(BaseModel, extra="forbid", strict=True, frozen=True):
     copies: int = Field(ge=1, description="tessellations of each training shape")
 
 
-class DataSettings(BaseModel, extra="forbid", strict=True, frozen=True):
+class DataSettings(Strict):
     """What every data set has; a data set's own settings are fields of a subclass."""
 
     name: str
     remesh: RemeshSettings | None = Field(description="remesh every shape; null: as it is")
+    features: Names = Field(
+        min_length=1, description="descriptors, one or a list: shot, raw, xyz (not invariant)"
+    )
     shot: ShotSettings
     shuffle_vertices: bool = Field(description="renumber the vertices of every mesh at random")
     cache_dir: Text = Field(description="folder of cached results")
@@ -51,4 +62,6 @@ class DataSettings(BaseModel, extra="forbid", strict=True, frozen=True):
 
     def own(self) -> dict[str, Any]:
         """The settings of this data set alone: the arguments of its class."""
-        return self.model_dump(exclude=set(DataSettings.model_fields))
+        shared = set(DataSettings.model_fields)
+        groups = {key for key, value in self if isinstance(value, BaseModel)}  # of descriptors
+        return self.model_dump(exclude=shared | groups)

@@ -7,6 +7,7 @@ from typing import Any
 import meshspiral.data.datasets  # noqa: F401  registers the data sets
 from meshspiral.data.cache import Cache
 from meshspiral.data.datamodule import CorrespondenceData
+from meshspiral.data.descriptors import Features
 from meshspiral.data.remeshed import Remeshed
 from meshspiral.data.settings import DataSettings
 from meshspiral.data.shapes import ShapeSet
@@ -32,7 +33,7 @@ def open_data(config: Any) -> CorrespondenceData:
     data = config.data
     return CorrespondenceData(
         open_shapes(data),
-        data.shot,
+        Features.of(data),
         Neighbourhood.of(config.neighbourhood),
         Cache(data.cache_dir),
         config.seed,

@@ -13,7 +13,6 @@ from tqdm import tqdm
 
 from meshspiral.data.datamodule import CorrespondenceData
 from meshspiral.data.files import write_file
-from meshspiral.data.settings import DataSettings
 from meshspiral.data.shapes import DataError
 from meshspiral.data.sources import open_data
 from meshspiral.evaluation.metrics import THRESHOLDS
@@ -50,8 +49,8 @@ def config_on_data(trained: TrainConfig, requested: dict[str, Any]) -> TrainConf
     Args:
         trained: The config of the run.
         requested: Data settings that replace those of the run. If they name a data set, only the
-            run's `shot`, `shuffle_vertices`, `cache_dir` and `workers` remain. `root`, `cache_dir`
-            and `workers` of None count as not requested.
+            run's descriptors, `shuffle_vertices`, `cache_dir` and `workers` remain. `root`,
+            `cache_dir` and `workers` of None count as not requested.
 
     Raises:
         ConfigError: A setting cannot be used.
@@ -60,8 +59,8 @@ def config_on_data(trained: TrainConfig, requested: dict[str, Any]) -> TrainConf
     given = {key: value for key, value in requested.items() if key not in unset}
     data = trained.data.model_dump()
     if "name" in given:
-        shared = DataSettings.model_fields.keys() - {"name", "remesh"}
-        data = {key: data[key] for key in shared} | {"remesh": None}
+        own = trained.data.own().keys() | {"name"}
+        data = {key: data[key] for key in data.keys() - own} | {"remesh": None}
     merged = OmegaConf.to_container(OmegaConf.merge(data, given))
     return read_stored_config(trained.model_dump() | {"data": merged}, "this evaluation")
 

@@ -304,6 +304,11 @@ def upgraded(values: dict[str, Any]) -> dict[str, Any]:
     if data.get("remesh"):
         data["remesh"].setdefault("copies", 1)
     data.setdefault("remesh", None)
+    data.setdefault("features", ["shot"])
+    data.setdefault("raw", {"radius": 0.16, "rings": 3, "rays": 8, "support": 0.3})
+    if values["neighbourhood"].get("name") == "spiral":
+        for key, value in {"dilation": 1, "start": "random", "support": 0.3, "jitter": 0}.items():
+            values["neighbourhood"].setdefault(key, value)
     data.setdefault("shuffle_vertices", False)
     values.setdefault("plugins", [])
     values.setdefault("picture", True)
@@ -374,8 +379,27 @@ def _read(schema: type[C], values: dict[str, Any]) -> C:
         if name not in classes:
             choices = ", ".join(sorted(classes))
             raise ConfigError(f"{group}.name must be one of {choices}, got {name}")
-        values[group] = _validated(classes[name].Settings, values[group], f"{group}.")
+        settings = classes[name].Settings
+        if group == "data":
+            settings = _data_settings(settings, values[group])
+        values[group] = _validated(settings, values[group], f"{group}.")
     return _validated(schema, values, "")
+
+
+def _data_settings(settings: type[DataSettings], values: dict[str, Any]) -> type[BaseModel]:
+    """The settings of a data set with those of all descriptors.
+
+    Raises:
+        ConfigError: `features` names a descriptor that is not registered.
+    """
+    from meshspiral.data.descriptors import Descriptor, settings_with_descriptors
+
+    names = values.get("features")
+    for name in [names] if isinstance(names, str) else names or []:
+        if name not in Descriptor.registered:
+            choices = ", ".join(sorted(Descriptor.registered))
+            raise ConfigError(f"data.features must be one of {choices}, or a list, got {name}")
+    return settings_with_descriptors(settings)
 
 
 def _spread_metric(values: dict[str, Any]) -> None:
@@ -450,6 +474,7 @@ RULES = {
     "less_than": "must be below {lt:.10g}",
     "finite_number": "must be a finite number",
     "literal_error": "must be one of {choices}",
+    "too_short": "must have at least {min_length} entry",
 }
 
 

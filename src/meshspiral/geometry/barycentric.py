@@ -10,10 +10,10 @@ def interpolate(values: np.ndarray, corners: np.ndarray, weights: np.ndarray) ->
 
     Args:
         values: float [W, D], one row per vertex, for instance its coordinates.
-        corners: int [V, 3], the vertices of the triangle around each point.
-        weights: float [V, 3], the barycentric coordinates of each point.
+        corners: int [..., 3], the vertices of the triangle around each point.
+        weights: float [..., 3], the barycentric coordinates of each point.
 
     Returns:
-        float [V, D], the value at each point.
+        float [..., D], the value at each point.
     """
-    return np.einsum("vk,vkx->vx", weights, values[corners])
+    return np.einsum("...k,...kx->...x", weights, values[corners])

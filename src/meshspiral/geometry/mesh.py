@@ -93,6 +93,12 @@ class Mesh:
             numbered=False,
         )
 
+    @property
+    def centred(self) -> np.ndarray:
+        """float64 [V, 3]: the vertices relative to their mean; float32 has no digits left far away
+        from the origin."""
+        return self.vertices - self.vertices.mean(axis=0)
+
     @cached_property
     def face_normals(self) -> np.ndarray:
         """float64 [F, 3]: the normal of every face, as long as twice the face's area."""

@@ -38,11 +38,16 @@ class PatchTable(NamedTuple):
     @property
     def whole(self) -> np.ndarray:
         """bool [V, rings, rays]: whether each sample exists."""
-        return self.weights.any(axis=3)
+        return self.weights.any(axis=-1)
 
 
 def geodesic_patches(
-    mesh: Mesh, radius: float, rings: int = 5, rays: int = 16, turn: np.ndarray | None = None
+    mesh: Mesh,
+    radius: float,
+    rings: int = 5,
+    rays: int = 16,
+    turn: np.ndarray | None = None,
+    clamp: bool = False,
 ) -> PatchTable:
     """The polar grids of all vertices (Masci et al. 2015).
 
@@ -60,6 +65,8 @@ def geodesic_patches(
         rays: Number of rays.
         turn: float [V], radians by which the grid of each vertex is turned counter-clockwise. None
             for no turn.
+        clamp: Give missing samples the last point of their ray: the one where it leaves the
+            surface, or the vertex itself if the ray cannot start. Then every sample exists.
 
     Returns:
         The table of V * rings * rays samples.
@@ -76,8 +83,13 @@ def geodesic_patches(
     exits = _exit_edges(neighbours, first, left)
     sectors = face_sectors(*surface)
     turn = np.zeros(len(mesh.vertices)) if turn is None else np.asarray(turn, dtype=np.float64)
-    _trace_all(*surface, exits, sectors, turn, float(radius), indices, weights)
-    return PatchTable(indices, weights)
+    _trace_all(*surface, exits, sectors, turn, float(radius), clamp, indices, weights)
+    table = PatchTable(indices, weights)
+    if clamp:
+        missing = ~table.whole
+        indices[missing] = missing.nonzero()[0][:, None]
+        weights[missing] = 1.0, 0.0, 0.0
+    return table
 
 
 def check_grid(radius: float, rings: int, rays: int) -> None:
@@ -171,7 +183,9 @@ def face_sectors(vertices, neighbours, first, left):
 
 
 @njit(cache=True)
-def _trace_all(vertices, neighbours, first, left, exits, sectors, turn, radius, indices, weights):
+def _trace_all(
+    vertices, neighbours, first, left, exits, sectors, turn, radius, clamp, indices, weights
+):
     """Trace the rays of all vertices; write indices and weights, [V, rings, rays, 3]."""
     rays = indices.shape[2]
     for v in range(len(first) - 1):
@@ -192,6 +206,7 @@ def _trace_all(vertices, neighbours, first, left, exits, sectors, turn, radius, 
                         left,
                         exits,
                         radius,
+                        clamp,
                         indices[v, :, ray],
                         weights[v, :, ray],
                     )
@@ -200,7 +215,18 @@ def _trace_all(vertices, neighbours, first, left, exits, sectors, turn, radius, 
 
 @njit(cache=True)
 def _trace(
-    v, edge, right_angle, left_angle, vertices, neighbours, left, exits, radius, indices, weights
+    v,
+    edge,
+    right_angle,
+    left_angle,
+    vertices,
+    neighbours,
+    left,
+    exits,
+    radius,
+    clamp,
+    indices,
+    weights,
 ):
     """Trace one ray and write its samples, [rings, 3].
 
@@ -213,7 +239,7 @@ def _trace(
         edge: Index of the directed edge from v whose left face the ray starts in.
         right_angle: Angle at v between that edge and the ray, in radians.
         left_angle: Angle at v between the ray and the face's other edge at v.
-        vertices, neighbours, left, exits, radius: As in `geodesic_patches`.
+        vertices, neighbours, left, exits, radius, clamp: As in `geodesic_patches`.
         indices: int32 [rings, 3], written.
         weights: float32 [rings, 3], written.
     """
@@ -240,8 +266,11 @@ def _trace(
             if ring == rings:
                 return
         d = left[edge]
-        if d < 0:
-            return  # the ray has left the surface
+        if d < 0:  # the ray has left the surface
+            for rest in range(ring, rings if clamp else ring):
+                for i in range(3):
+                    indices[rest, i], weights[rest, i] = corners[i], leave[i]
+            return
         ex, ey = cx - bx, cy - by
         length = np.sqrt(ex * ex + ey * ey)
         ex, ey = (ex / length, ey / length) if length > 0 else (0.0, 1.0)

@@ -66,21 +66,57 @@ def shot_descriptors(
             its square in float32, is not positive and finite.
     """
     vertices, normals = np.asarray(vertices), np.asarray(normals)
-    if vertices.ndim != 2 or vertices.shape[1] != 3:
-        raise ValueError(f"vertices must be [V, 3], got {vertices.shape}")
+    check_support(vertices, radius)
     if normals.shape != vertices.shape:
         raise ValueError(
             f"normals must be {vertices.shape}, like the vertices, got {normals.shape}"
         )
     if not isinstance(bins, (int, np.integer)) or bins < 1:
         raise ValueError(f"bins must be an integer of at least 1, got {bins}")
+    return _descriptors_and_frames(vertices, normals, radius, bins, pcl_cosine_wrap)[0]
+
+
+def check_support(vertices: np.ndarray, radius: float) -> None:
+    """Check the points and the radius of a support.
+
+    Raises:
+        ValueError: The vertices are not [V, 3]; or `radius`, or its square in float32, is not
+            positive and finite.
+    """
+    if vertices.ndim != 2 or vertices.shape[1] != 3:
+        raise ValueError(f"vertices must be [V, 3], got {vertices.shape}")
     with np.errstate(over="ignore", under="ignore"):
         square = np.float32(float(radius) * float(radius))
     if not (radius > 0 and 0 < square < np.inf):
         raise ValueError(
             f"radius must be positive and finite, and so must its float32 square, got {radius}"
         )
-    return _descriptors_and_frames(vertices, normals, radius, bins, pcl_cosine_wrap)[0]
+
+
+def local_frames(vertices: np.ndarray, radius: float) -> np.ndarray:
+    """The local frame of every vertex (Salti, Tombari, Di Stefano 2014, section 3).
+
+    The axes are those of the covariance of the vertices nearer than the radius, weighted by radius
+    - distance. The x axis has the largest variance and points to the side with most of them; so
+    does the z axis, which has the smallest; y is z x x.
+
+    Args:
+        vertices: float [V, 3]; as for `shot_descriptors`.
+        radius: Of the support, in the unit of the vertices.
+
+    Returns:
+        float32 [V, 3, 3], rows x, y, z; NaN where fewer than five vertices are in the support.
+
+    Raises:
+        ValueError: As `shot_descriptors`.
+    """
+    check_support(np.asarray(vertices), radius)
+    frames = np.full((len(vertices), 3, 3), np.nan, dtype=np.float32)
+    sorted_points = _sorted_by_cell(vertices, radius)
+    if sorted_points is not None:
+        points, cells, ranges, order = sorted_points
+        _frames_kernel(points, cells, ranges, order, float(radius), frames)
+    return frames
 
 
 def _descriptors_and_frames(vertices, normals, radius, bins, pcl_cosine_wrap):
@@ -92,16 +128,13 @@ def _descriptors_and_frames(vertices, normals, radius, bins, pcl_cosine_wrap):
     rows = np.full((len(vertices), SECTORS * (int(bins) + 1)), np.nan, dtype=np.float32)
     frames = np.full((len(vertices), 3, 3), np.nan, dtype=np.float32)
     with np.errstate(over="ignore"):
-        points, directions = vertices.astype(np.float32), normals.astype(np.float32)
+        directions = normals.astype(np.float32)
     directions[~np.isfinite(directions).all(1)] = np.nan
-    usable = np.flatnonzero(np.isfinite(points).all(1))
-    if len(usable):
-        keys = _cell_keys(points[usable], float(radius))
-        order = np.lexsort((*points[usable].T, keys))
-        cells, ranges = _candidate_ranges(keys[order])
-        order = usable[order]
+    sorted_points = _sorted_by_cell(vertices, radius)
+    if sorted_points is not None:
+        points, cells, ranges, order = sorted_points
         _kernel(
-            np.ascontiguousarray(points[order].T),
+            points,
             np.ascontiguousarray(directions[order].T),
             cells,
             ranges,
@@ -113,6 +146,25 @@ def _descriptors_and_frames(vertices, normals, radius, bins, pcl_cosine_wrap):
             frames,
         )
     return rows, frames
+
+
+def _sorted_by_cell(vertices: np.ndarray, radius: float) -> tuple[np.ndarray, ...] | None:
+    """The vertices with finite float32 coordinates, sorted by the cell of a search grid.
+
+    Returns:
+        The points, float32 [3, N]; `cells` and `ranges` of `_candidate_ranges`; and the vertex of
+        every point, int64 [N]. None if N is 0.
+    """
+    with np.errstate(over="ignore"):
+        points = vertices.astype(np.float32)
+    usable = np.flatnonzero(np.isfinite(points).all(1))
+    if not len(usable):
+        return None
+    keys = _cell_keys(points[usable], float(radius))
+    order = np.lexsort((*points[usable].T, keys))
+    cells, ranges = _candidate_ranges(keys[order])
+    order = usable[order]
+    return np.ascontiguousarray(points[order].T), cells, ranges, order
 
 
 def _cell_keys(points: np.ndarray, radius: float) -> np.ndarray:
@@ -172,11 +224,7 @@ def _kernel(points, normals, cells, ranges, order, radius, bins, wrap, rows, fra
         m = _neighbours(points, i, ranges[cells[i]], limit, index, square)
         if m < LEAST_NEIGHBOURS:
             continue
-        for k in range(m):
-            # in float32, like PCL: where axes are nearly tied, more digits rotate them by 1e-5
-            distance[k] = np.sqrt(square[k])
-            for axis in range(3):
-                offset[axis, k] = points[axis, index[k]] - points[axis, i]
+        _offsets(points, i, index, square, m, offset, distance)
         frame = frames[order[i]]
         _local_frame(offset, distance, square, m, radius, frame)
         _vote(offset, distance, normals, index, m, frame, radius, bins, wrap, histogram)
@@ -187,6 +235,32 @@ def _kernel(points, normals, cells, ranges, order, radius, bins, wrap, rows, fra
             scale = 1 / math.sqrt(total)
             for c in range(len(histogram)):
                 rows[order[i], c] = histogram[c] * scale
+
+
+@njit(cache=True, error_model="numpy")
+def _frames_kernel(points, cells, ranges, order, radius, frames):
+    """Write the local frames of all usable points; arguments as for `_kernel`."""
+    n = points.shape[1]
+    index, square = np.empty(n + 1, np.int64), np.empty(n + 1, np.float32)
+    distance = np.empty(n, np.float64)
+    offset = np.empty((3, n), np.float32)
+    limit = np.float32(radius * radius)
+    for i in range(n):
+        m = _neighbours(points, i, ranges[cells[i]], limit, index, square)
+        if m < LEAST_NEIGHBOURS:
+            continue
+        _offsets(points, i, index, square, m, offset, distance)
+        _local_frame(offset, distance, square, m, radius, frames[order[i]])
+
+
+@njit(cache=True, error_model="numpy")
+def _offsets(points, i, index, square, m, offset, distance):
+    """Write the offsets, float32 [3, N], and distances, float64 [N], of the m neighbours."""
+    for k in range(m):
+        # in float32, like PCL: where axes are nearly tied, more digits rotate them by 1e-5
+        distance[k] = np.sqrt(square[k])
+        for axis in range(3):
+            offset[axis, k] = points[axis, index[k]] - points[axis, i]
 
 
 @njit(cache=True, error_model="numpy")

@@ -15,8 +15,8 @@ import numpy as np
 import torch
 from scipy.spatial import cKDTree
 
-from meshspiral.data.datamodule import described_tensors
-from meshspiral.data.preprocessing import descriptor_task
+from meshspiral.data.datamodule import mesh_tensors
+from meshspiral.data.descriptors import Features
 from meshspiral.data.scans import Scan
 from meshspiral.experiment.run_folder import BEST
 from meshspiral.experiment.schema import TrainConfig
@@ -94,7 +94,7 @@ class Matcher:
         self.up = saved["up"]
         self._training_size = int(saved["resolution"])  # vertices of a training mesh
         self._resampled, self._smooth = resampled, smooth
-        self._shot = config.data.shot
+        self._features = Features.of(config.data)
         self._predictor = Predictor(saved, config, accelerator)
 
     @classmethod
@@ -165,10 +165,7 @@ class Matcher:
         Returns:
             Vertices of the template, int64 [W], and their probabilities, float32 [W].
         """
-        descriptors = descriptor_task(mesh, self._shot)
-        neighbourhood = self._predictor.neighbourhood
-        batch = described_tensors(descriptors.compute(*descriptors.arguments), mesh, self._shot)
-        batch |= neighbourhood.tensors(neighbourhood.compute(mesh), mesh)
+        batch = mesh_tensors(mesh, self._features, self._predictor.neighbourhood)
         batch["index"] = 0
         prediction = self._predictor(batch, "evaluation")
         template, confidence = prediction.classes.cpu().numpy(), prediction.probability

@@ -30,7 +30,6 @@ class Neighbourhood(ABC):
         gives: Name of the batch entry that networks read; a network fits if its `reads` equals it.
         noun: What the tables hold, in the plural, for messages; by default the name.
         modules: Modules whose source code is part of the cache key, beside the class's own.
-        random: Whether `draw` makes random choices.
         density_range: Meshes with up to this many times more or fewer vertices than the training
             meshes are labelled as they are; others are resampled first.
     """
@@ -40,7 +39,6 @@ class Neighbourhood(ABC):
     gives: ClassVar[str]
     noun: ClassVar[str]
     modules: ClassVar[tuple[ModuleType, ...]] = ()
-    random: ClassVar[bool] = False
     density_range: ClassVar[float] = 1.5  # for tables that grow with the edges, as spirals do
 
     class Settings(BaseModel, extra="forbid", strict=True, frozen=True):
@@ -78,6 +76,25 @@ class Neighbourhood(ABC):
         """The length of the sequences in plots and tables, e.g. "N = 20"; None without any."""
         return None
 
+    @property
+    def least_vertices(self) -> int:
+        """Number of vertices that a mesh must have; by default the length of a sequence."""
+        return self.length or 1
+
+    @property
+    def random(self) -> bool:
+        """Whether `draw` makes random choices in evaluation."""
+        return False
+
+    @property
+    def frame_support(self) -> float | None:
+        """Radius of local frames over the square root of the surface area; None for no frames.
+
+        If it is a number, `compute` and `tensors` get the frames of `local_frames` as a further
+        argument, float32 [V, 3, 3].
+        """
+        return None
+
     def mesh_key(self, mesh: Mesh) -> tuple:
         """The arrays of the mesh on which `compute` depends; by default all of it."""
         return mesh.vertices, mesh.faces
@@ -106,11 +123,12 @@ class Neighbourhood(ABC):
             `gives` is among them.
         """
 
-    def draw(self, batch: Batch, generator: torch.Generator) -> Batch:
+    def draw(self, batch: Batch, generator: torch.Generator, training: bool = False) -> Batch:
         """The batch with the entry `gives`, in which random choices come from `generator`.
 
         Args:
             batch: Entries of `tensors`, beside others, on any device.
             generator: On the same device.
+            training: Whether the batch is trained on.
         """
         return batch

@@ -17,7 +17,7 @@ from meshspiral.nn.networks import Network
 from meshspiral.reporting.runs import Run
 
 # data settings that do not tell data sets apart: what is computed of a shape
-NOT_OF_DATA = ("shot.", "shuffle_vertices")
+NOT_OF_DATA = ("features", "shot.", "raw.", "shuffle_vertices")
 
 
 @dataclass(frozen=True, eq=False)

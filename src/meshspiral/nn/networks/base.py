@@ -133,9 +133,13 @@ class Network(nn.Module):
             float [V, 256].
         """
         x = self.dropout(torch.relu(self.lift(features * self.feature_scale)))
-        for layer in self.layers:
-            x = torch.relu(layer(x, *neighbourhood))
+        for i in range(len(self.layers)):
+            x = torch.relu(self.convolve(i, x, *neighbourhood))
         return self.dropout(torch.relu(self.neck(x)))
+
+    def convolve(self, i: int, x: Tensor, *neighbourhood) -> Tensor:
+        """The output of the i-th of the three layers, before the ReLU."""
+        return self.layers[i](x, *neighbourhood)
 
     def forward(self, features: Tensor, *neighbourhood) -> Tensor:
         """Scores before the softmax, float [V, num_classes]. Arguments as for `embed`."""

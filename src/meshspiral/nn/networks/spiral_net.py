@@ -8,6 +8,7 @@ from typing import Any, Literal, get_args
 from pydantic import Field
 from torch import Tensor, nn
 
+from meshspiral.nn.geodesic import Resampling, resample
 from meshspiral.nn.layers import metric_features
 from meshspiral.nn.networks.base import Network
 
@@ -72,18 +73,36 @@ class SpiralNet(Network):
         raise NotImplementedError
 
     def embed_batch(self, batch: Mapping[str, Any]) -> Tensor:
+        spirals, places = batch["spirals"], batch.get("places")
+        if isinstance(places, dict):
+            places = Resampling(**places)
+        elif places is not None:
+            places = tuple(Resampling(**each) for each in places)
         metric = None
         if self.metric:
-            metric = metric_features(batch["vertices"], batch["spirals"], batch["unit"])
-        return self.embed(batch["features"], batch["spirals"], metric)
+            vertices, unit = batch["vertices"], batch["unit"]
+            metric = []
+            for i in range(len(spirals) if isinstance(spirals, tuple) else 1):
+                sequences, sampled = _of_layer(i, spirals, places)
+                points = vertices if sampled is None else resample(vertices, sampled)
+                metric.append(metric_features(points, sequences, unit))
+            metric = tuple(metric) if isinstance(spirals, tuple) else metric[0]
+        return self.embed(batch["features"], spirals, metric, places)
 
-    def embed(self, features: Tensor, spirals: Tensor, metric: Tensor | None = None) -> Tensor:
-        """Everything but the last layer.
+    def embed(
+        self,
+        features: Tensor,
+        spirals: Tensor | tuple[Tensor, ...],
+        metric: Tensor | tuple[Tensor, ...] | None = None,
+        places: Resampling | tuple[Resampling, ...] | None = None,
+    ) -> Tensor:
+        """Everything but the last layer. A tuple has an entry for each of the three layers.
 
         Args:
             features: float [V, in_features].
-            spirals: int64 [V, N], -1 where a spiral has ended.
+            spirals: int64 [V, N], -1 where a spiral has ended; vertices, or rows of `places`.
             metric: float [V, N, 2], see `metric_features`.
+            places: Points whose features are blended from those of vertices; None for vertices.
 
         Returns:
             float [V, 256].
@@ -94,4 +113,15 @@ class SpiralNet(Network):
         if (metric is not None) != self.metric:
             negation = "" if self.metric else "out"
             raise ValueError(f"this network was made with{negation} metric information")
-        return super().embed(features, spirals, metric)
+        return super().embed(features, spirals, metric, places)
+
+    def convolve(self, i: int, x: Tensor, *neighbourhood) -> Tensor:
+        spirals, metric, places = _of_layer(i, *neighbourhood)
+        if places is not None:
+            x = resample(x, places)
+        return self.layers[i](x, spirals, metric)
+
+
+def _of_layer(i: int, *values: Any) -> list[Any]:
+    """What the i-th layer reads of values that may be tuples with an entry for each layer."""
+    return [v[i] if type(v) is tuple else v for v in values]  # a Resampling is a tuple too

@@ -1,0 +1,104 @@
+"""The base class of descriptors, and their registry."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+from functools import cache
+from types import ModuleType
+from typing import Any, ClassVar
+
+import numpy as np
+from pydantic import BaseModel, create_model
+
+from meshspiral.data.settings import DataSettings
+from meshspiral.geometry.mesh import Mesh
+
+
+class Descriptor(ABC):
+    """Numbers that describe the surface around each vertex of a mesh.
+
+    A subclass registers under a name, `class Shot(Descriptor, name="shot")`, by which
+    `data.features` finds it. The fields of its `Settings` are the settings `data.<name>.*`. Entries
+    should be about as large as those of SHOT, 1 / sqrt(544), so that one `model.feature_scale`
+    suits all.
+
+    Class attributes:
+        registered: All descriptors, by name.
+        modules: Modules whose source code is part of the cache key, beside the class's own.
+    """
+
+    registered: ClassVar[dict[str, type[Descriptor]]] = {}
+    name: ClassVar[str]
+    modules: ClassVar[tuple[ModuleType, ...]] = ()
+
+    class Settings(BaseModel, extra="forbid", strict=True, frozen=True):
+        """The settings `data.<name>`. Those of a plugin need default values."""
+
+    def __init_subclass__(cls, name: str | None = None, **options: Any) -> None:
+        super().__init_subclass__(**options)
+        if name is not None:
+            cls.name = name
+            Descriptor.registered[name] = cls
+
+    def __init__(self, settings: Any):
+        self.settings = settings
+
+    @property
+    @abstractmethod
+    def channels(self) -> int:
+        """Number of channels."""
+
+    @property
+    def frame_support(self) -> float | None:
+        """Radius of the local frames that `compute` needs, over the square root of the area."""
+        return None
+
+    @abstractmethod
+    def compute(self, mesh: Mesh, frames: np.ndarray | None = None) -> np.ndarray:
+        """Describe every vertex.
+
+        Args:
+            mesh: The surface, of an area above 0.
+            frames: If `frame_support` is a number, the frames of `local_frames`, float32 [V, 3, 3].
+
+        Returns:
+            float32 [V, channels], with NaN in rows where the descriptor is undefined.
+        """
+
+
+@dataclass(frozen=True, eq=False)
+class Features:
+    """The descriptors of a data set, side by side.
+
+    Args:
+        descriptors: In the order of the channels.
+        unit: Length by which metric information is divided, over the square root of the area.
+    """
+
+    descriptors: tuple[Descriptor, ...]
+    unit: float
+
+    @staticmethod
+    def of(data: DataSettings) -> Features:
+        """Those that the settings of a data set name."""
+        descriptors = (
+            Descriptor.registered[name](getattr(data, name, None)) for name in data.features
+        )
+        return Features(tuple(descriptors), data.shot.radius)
+
+    @property
+    def channels(self) -> int:
+        """Number of channels of all descriptors together."""
+        return sum(descriptor.channels for descriptor in self.descriptors)
+
+
+@cache
+def settings_with_descriptors(settings: type[DataSettings]) -> type[DataSettings]:
+    """The settings of a data set, with a group of settings for every registered descriptor."""
+    fields: dict[str, Any] = {}
+    for name, descriptor in Descriptor.registered.items():
+        if name not in DataSettings.model_fields and descriptor.Settings.model_fields:
+            required = any(f.is_required() for f in descriptor.Settings.model_fields.values())
+            fields[name] = (descriptor.Settings, ... if required else descriptor.Settings())
+    return create_model(settings.__name__, __base__=settings, **fields)

@@ -1,0 +1,25 @@
+"""SHOT descriptors (Salti, Tombari, Di Stefano 2014)."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from meshspiral.data.descriptors.base import Descriptor
+from meshspiral.data.settings import ShotSettings
+from meshspiral.geometry import angles, shot
+from meshspiral.geometry.mesh import Mesh
+
+
+class Shot(Descriptor, name="shot"):
+    """Histograms of normals in a local frame: invariant to rotation, translation and scale."""
+
+    modules = (angles, shot)
+    Settings = ShotSettings
+
+    @property
+    def channels(self) -> int:
+        return shot.SECTORS * (self.settings.bins + 1)
+
+    def compute(self, mesh: Mesh, frames: np.ndarray | None = None) -> np.ndarray:
+        radius = self.settings.radius * np.sqrt(mesh.area)
+        return shot.shot_descriptors(mesh.centred, mesh.vertex_normals, radius, self.settings.bins)

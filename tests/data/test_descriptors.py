@@ -1,0 +1,100 @@
+"""Descriptors by name, side by side, and what each is invariant to."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from meshspiral.data.descriptors import Descriptor, Features
+from meshspiral.data.descriptors.raw import Raw
+from meshspiral.data.descriptors.xyz import Xyz
+from meshspiral.data.preprocessing import compute_task, descriptor_task
+from meshspiral.experiment.schema import ConfigError
+from meshspiral.geometry.mesh import Mesh
+from tests.helpers import composed
+from tests.meshes import bumpy_sphere, lattice, union
+
+RAW = Raw(Raw.Settings(radius=0.4, rings=2, rays=5, support=0.8))
+
+
+def described(mesh: Mesh, descriptor: Descriptor) -> np.ndarray:
+    return compute_task(descriptor_task(mesh, descriptor))["features"]
+
+
+def moved(mesh: Mesh, scale: float = 7.0) -> Mesh:
+    q, _ = np.linalg.qr(np.random.default_rng(0).normal(size=(3, 3)))
+    q *= np.sign(np.linalg.det(q))
+    return Mesh(scale * mesh.vertices @ q.T + [30.0, -20, 5], mesh.faces)
+
+
+def test_raw_geometry_is_invariant_to_rotation_translation_and_scale():
+    mesh = bumpy_sphere(3, 3)
+    ours, theirs = described(mesh, RAW), described(moved(mesh), RAW)
+    assert ours.shape == (len(mesh.vertices), RAW.channels) and ours.dtype == np.float32
+    same = np.abs(ours - theirs).max(axis=1) < 1e-3 * np.abs(ours).max()
+    assert same.mean() > 0.99  # rounding flips an axis where its sides tie
+
+
+def test_raw_geometry_sees_another_shape_and_a_mirrored_one():
+    mesh = bumpy_sphere(3, 3)
+    other = bumpy_sphere(4, 3)
+    mirrored = Mesh(mesh.vertices * [1, 1, -1], mesh.faces[:, ::-1])
+    for change in (other, mirrored):
+        apart = np.abs(described(mesh, RAW) - described(change, RAW)).max(axis=1)
+        assert (apart > 0.05 * np.abs(described(mesh, RAW)).max()).mean() > 0.9
+
+
+def test_raw_geometry_of_a_plane_in_closed_form():
+    mesh = lattice(25, 25)
+    count = len(mesh.vertices)
+    frames = np.tile(np.eye(3, dtype=np.float32), (count, 1, 1))
+    raw = Raw(Raw.Settings(radius=3.0 / np.sqrt(mesh.area), rings=2, rays=4, support=1.0))
+    row = raw.compute(mesh, frames)[12 * 25 + 12] * np.sqrt(544)
+    places = row[:-3].reshape(2, 4, 8)
+    angles = -np.arange(4) * np.pi / 2
+    for i, length in enumerate((0.5, 1.0)):
+        expected = length * np.stack([np.cos(angles), np.sin(angles), 0 * angles], 1)
+        np.testing.assert_allclose(places[i, :, :3], expected, atol=1e-5)
+        np.testing.assert_allclose(places[i, :, 3:6], [[0, 0, 1]] * 4, atol=1e-5)
+        np.testing.assert_allclose(places[i, :, 6], length, atol=1e-5)
+        np.testing.assert_allclose(places[i, :, 7], np.pi / 2, atol=1e-5)
+    np.testing.assert_allclose(row[-3:], [0, 0, 1], atol=1e-6)
+
+
+def test_raw_geometry_is_undefined_without_a_frame():
+    mesh = union(bumpy_sphere(), lattice(2, 2))
+    raw = Raw(Raw.Settings(radius=0.4, rings=2, rays=5, support=0.1))
+    result = compute_task(descriptor_task(mesh, raw))
+    assert result["undefined"] >= 4 and not result["features"][-4:].any()
+
+
+def test_positions_change_with_the_pose_of_the_mesh_and_not_with_its_unit():
+    mesh, xyz = bumpy_sphere(), Xyz(Xyz.Settings())
+    scaled = Mesh(5 * mesh.vertices + 3, mesh.faces)
+    np.testing.assert_allclose(described(scaled, xyz), described(mesh, xyz), atol=1e-6)
+    assert np.abs(described(moved(mesh), xyz) - described(mesh, xyz)).max() > 0.01
+
+
+def test_descriptors_stand_side_by_side():
+    config = composed(["data.features=[shot,raw,xyz]", "data.raw.rays=4"])
+    features = Features.of(config.data)
+    assert [d.name for d in features.descriptors] == ["shot", "raw", "xyz"]
+    assert features.channels == 544 + 8 * 3 * 4 + 3 + 3
+    assert Features.of(composed([]).data).channels == 544
+
+
+@pytest.mark.parametrize(
+    "override, message",
+    [
+        (
+            "data.features=shott",
+            "must be one of raw, shot, xyz, or a list, got shott",
+        ),
+        ("data.features=[]", "data.features must have at least 1 entry"),
+        ("data.raw.rings=0", "data.raw.rings must be at least 1, got 0"),
+        ("data.shot.bins=0", "data.shot.bins must be at least 1, got 0"),
+    ],
+)
+def test_wrong_features_are_one_line(override, message):
+    with pytest.raises(ConfigError, match=message.replace("[", "\\[")):
+        composed([override])
