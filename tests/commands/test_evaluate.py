@@ -22,7 +22,6 @@ from meshspiral.evaluation.outcome import Outcome, Result, evenly, result_of, ro
 from meshspiral.evaluation.retest import config_on_data
 from meshspiral.experiment.run_folder import BEST, CONFIG, ERRORS, METRICS, RunError
 from meshspiral.experiment.schema import ConfigError
-from meshspiral.neighbourhoods import Neighbourhood
 from meshspiral.training.checkpoints import template_of
 from tests.conftest import toy_shapes
 from tests.helpers import composed, run
@@ -312,8 +311,6 @@ class LabelledWithPoints(ShapeSet):
 
 @pytest.fixture
 def point_data(tmp_path):
-    spirals = Neighbourhood.registered["spiral"]
-    neighbourhood = spirals(spirals.Settings(name="spiral", seq_len=8, rings=None))
     features = Features((Shot(ShotSettings(radius=0.3, bins=4)),), 0.3)
     return CorrespondenceData(
         LabelledWithPoints(), features, neighbourhood, Cache(tmp_path), workers=1
@@ -374,3 +371,25 @@ def test_a_checkpoint_holds_the_template_and_no_optimizer_state(trained):
     faces = toy_shapes()["template.ply"].faces
     np.testing.assert_array_equal(template_of(saved).faces, faces)
     assert saved["resolution"] == 162 and "optimizer_states" not in saved
+
+
+def test_votes_predict_from_several_draws_in_a_folder_of_their_own(cli, moved):
+    folder, metrics = moved
+    code, out, err = cli(f"run={folder}", "votes=5", "shapes=0", program=main)
+    assert code == 0, err
+    voted = json.loads((folder / "evaluation" / "folder-votes5" / METRICS).read_text())
+    assert voted["test/exact_match"] != metrics["test/exact_match"]
+    assert voted["test/exact_match"] == pytest.approx(metrics["test/exact_match"], abs=0.1)
+    assert "per mesh, 5 votes" in out
+
+
+@pytest.mark.parametrize("override", ["votes=2", "rotations=2"])
+def test_draws_that_are_not_random_cannot_vote(cli, moved, tmp_path, override):
+    folder = tmp_path / "frame"
+    shutil.copytree(moved[0], folder)
+    saved = torch.load(folder / BEST, weights_only=True)
+    saved["hyper_parameters"]["config"]["neighbourhood"] |= {"start": "frame"}
+    torch.save(saved, folder / BEST)
+    code, out, _ = cli(f"run={folder}", override, "shapes=0", program=main)
+    key, least = override.split("=")[0], 1 if "votes" in override else 0
+    assert code == 1 and f"{key} must be {least} for fcs, whose spirals are not random" in out

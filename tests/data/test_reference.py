@@ -9,7 +9,7 @@ from meshspiral.data.cache import Cache
 from meshspiral.data.reference import BLOCK, ReferenceDistances
 from meshspiral.geometry.geodesics import GeodesicSolver
 from meshspiral.geometry.mesh import Mesh
-from tests.meshes import icosphere, union
+from tests.meshes import bumpy_sphere, icosphere, lattice, union
 
 
 @pytest.fixture
@@ -56,3 +56,27 @@ def test_the_rows_in_memory_are_bounded(reference, monkeypatch):
 def test_a_pair_on_two_components_counts_as_the_diameter(tmp_path):
     reference = ReferenceDistances(union(icosphere(1), icosphere(1)), Cache(tmp_path))
     assert reference(np.array([0]), np.array([50]))[0] == pytest.approx(reference.diameter)
+
+
+def test_the_heat_kernel_is_a_normal_distribution_on_a_plane(tmp_path):
+    """Mean squared distance 2 width^2, probabilities in proportion to area and kernel."""
+    mesh = lattice(41, 41)
+    reference = ReferenceDistances(mesh, Cache(tmp_path))
+    width = 2.5 / np.sqrt(mesh.area)
+    vertices, weights = reference.heat_kernel(width)
+    centre = 20 * 41 + 20
+    np.testing.assert_allclose(weights.sum(axis=1), 1, atol=1e-5)
+    offsets = mesh.vertices[vertices[centre]] - mesh.vertices[centre]
+    squared = (offsets**2).sum(axis=1)
+    # a normal distribution cut at three standard deviations
+    expected = 2 * 2.5**2 * (1 - 5.5 * np.exp(-4.5)) / (1 - np.exp(-4.5))
+    assert (weights[centre] * squared).sum() == pytest.approx(expected, rel=0.03)
+    own = weights[centre][vertices[centre] == centre].max()
+    assert own == weights[centre].max()
+
+
+def test_a_narrow_heat_kernel_is_the_vertex_itself(tmp_path):
+    mesh = union(bumpy_sphere(), Mesh([[0, 0, 0]], []))
+    vertices, weights = ReferenceDistances(mesh, Cache(tmp_path)).heat_kernel(1e-4)
+    np.testing.assert_array_equal(vertices[:, 0], np.arange(len(mesh.vertices)))
+    np.testing.assert_array_equal(weights[:, 0], 1)

@@ -8,6 +8,7 @@ from torch.nn import functional as F
 
 from meshspiral.nn import layers, recurrence
 from meshspiral.nn.layers import SpiralLinear, SpiralLSTM, metric_features
+from meshspiral.nn.networks.conv import SpiralConv
 
 
 def sequences(vertices, length, padded, seed=0):
@@ -222,3 +223,29 @@ def test_more_padding_does_not_change_an_lstm():
     features, spirals = torch.randn(9, 3), sequences(9, 5, padded=True)
     longer = F.pad(spirals, (0, 4), value=-1)
     torch.testing.assert_close(layer(features, spirals), layer(features, longer))
+
+
+@pytest.mark.parametrize("taps", [1, 3, 5])
+@pytest.mark.parametrize("metric", [False, True])
+def test_the_convolution_equals_torchs_along_each_spiral(taps, metric):
+    torch.manual_seed(0)
+    layer = SpiralConv(3, 4, 6, hidden=5, taps=taps, metric=metric).double()
+    torch.nn.init.normal_(layer.position)
+    x, information = torch.randn(9, 3).double(), torch.rand(9, 6, 2).double()
+    spirals = torch.randint(0, 9, (9, 6))
+    spirals[2, 4:] = spirals[5, 1:] = -1
+    ended = spirals < 0
+    sequences = x[spirals.clamp(min=0)].masked_fill(ended[..., None], 0.0).transpose(1, 2)
+    kernel = layer.taps_in.weight.view(taps, 5, 3).permute(1, 2, 0)
+    hidden = torch.nn.functional.conv1d(sequences, kernel, padding=taps // 2).transpose(1, 2)
+    hidden = hidden + layer.position
+    if metric:
+        hidden = hidden + layer.metric(information)
+    hidden = torch.relu(hidden).masked_fill(ended[..., None], 0.0)
+    expected = layer.out((hidden * layer.sum).sum(1))
+    torch.testing.assert_close(layer(x, spirals, information if metric else None), expected)
+
+
+def test_the_convolution_refuses_another_length():
+    with pytest.raises(ValueError, match="spirals must have length 6, got 5"):
+        SpiralConv(3, 4, 6, hidden=5)(torch.rand(9, 3), torch.zeros(9, 5, dtype=torch.int64))

@@ -5,7 +5,7 @@ import torch
 from torch.nn import functional as F
 
 from meshspiral.nn import loss as module
-from meshspiral.nn.loss import linear_cross_entropy, predict
+from meshspiral.nn.loss import Points, SoftLabels, linear_cross_entropy, predict
 
 
 @pytest.fixture
@@ -82,3 +82,54 @@ def test_predict_is_the_argmax_and_the_loss(layer, rows, monkeypatch):
     torch.testing.assert_close(of_label, label_probability, rtol=0, atol=1e-12)
     assert predict(*layer[:3]).loss is None and predict(*layer[:3]).of_label is None
     torch.testing.assert_close(loss, F.cross_entropy(scores, labels), rtol=0, atol=1e-12)
+
+
+@pytest.fixture
+def soft():
+    """Distributions over up to four classes, the last entries of some unused."""
+    generator = torch.Generator().manual_seed(1)
+    classes = torch.randint(0, 17, (17, 4), generator=generator)
+    classes[:, 0] = torch.arange(17)
+    weights = torch.rand(17, 4, generator=generator, dtype=torch.float64)
+    weights[::3, 2:] = 0.0
+    return SoftLabels(classes, weights / weights.sum(1, keepdim=True))
+
+
+def distributions(soft: SoftLabels) -> torch.Tensor:
+    """float [K, K], the rows written out."""
+    full = torch.zeros(17, 17, dtype=torch.float64)
+    return full.scatter_add_(1, soft.classes, soft.weights)
+
+
+@pytest.mark.parametrize("rows", [7, 512])
+@pytest.mark.parametrize("between", [False, True])
+def test_soft_labels_equal_cross_entropy_of_distributions(layer, soft, rows, between, monkeypatch):
+    monkeypatch.setattr(module, "ROWS", rows)
+    x, weight, bias, labels = layer
+    targets = distributions(soft)[labels]
+    if between:
+        corners = torch.randint(0, 17, (23, 3))
+        shares = torch.rand(23, 3, dtype=torch.float64)
+        shares /= shares.sum(1, keepdim=True)
+        labels = Points(corners, shares)
+        targets = (distributions(soft)[corners] * shares[..., None]).sum(1)
+    loss = linear_cross_entropy(x, weight, bias, labels, soft)
+    reference = F.cross_entropy(F.linear(x, weight, bias), targets)
+    torch.testing.assert_close(loss, reference, rtol=0, atol=1e-12)
+    for a, b in zip(
+        torch.autograd.grad(loss, (x, weight, bias)),
+        torch.autograd.grad(reference, (x, weight, bias)),
+        strict=True,
+    ):
+        torch.testing.assert_close(a, b, rtol=0, atol=1e-9)
+
+
+def test_votes_are_the_mean_of_log_probabilities(layer):
+    x, weight, bias, labels = layer
+    inputs = [x, torch.roll(x, 1, 0), x * 0.3]
+    found = predict(inputs, weight, bias, labels)
+    votes = torch.stack([F.linear(each, weight, bias).log_softmax(1) for each in inputs])
+    expected = votes.mean(0).softmax(1)
+    torch.testing.assert_close(found.probability, expected.max(1).values)
+    assert torch.equal(found.classes, expected.argmax(1))
+    torch.testing.assert_close(found.of_label, expected.gather(1, labels[:, None])[:, 0])

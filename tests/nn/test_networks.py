@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from meshspiral.nn.networks import GCNN3, FCSNet, LSTMNet
+from meshspiral.nn.networks import GCNN3, ConvNet, FCSNet, LSTMNet
 from tests.nn.test_geodesic import as_resampling, patches
 
 
@@ -24,6 +24,11 @@ def test_gcnn3_has_the_parameters_of_table_1():
     assert parameters(GCNN3(544, 6890)) == 2_672_634
 
 
+@pytest.mark.parametrize("length", [20, 25, 30])
+def test_conv_net_has_about_as_many_parameters_as_the_others(length):
+    assert parameters(ConvNet(544, 6890, length)) == pytest.approx(2.7e6, rel=0.06)
+
+
 def test_metric_information_adds_two_channels_to_the_layers_that_take_it():
     fcs, n = parameters(FCSNet(544, 6890, 20)), 20
     assert parameters(FCSNet(544, 6890, n, metric=True)) == fcs + 2 * n * (100 + 150 + 200)
@@ -35,8 +40,9 @@ def test_metric_information_adds_two_channels_to_the_layers_that_take_it():
 
 def make(name, metric=False, **options):
     torch.manual_seed(0)
-    if name == "fcs":
-        return FCSNet(10, 21, 6, channels=[5, 6, 7], metric=metric, **options)
+    if name in ("fcs", "conv"):
+        network = FCSNet if name == "fcs" else ConvNet
+        return network(10, 21, 6, channels=[5, 6, 7], metric=metric, **options)
     return LSTMNet(10, 21, channels=[5, 6, 7], metric=metric, **options)
 
 
@@ -47,7 +53,7 @@ def batch():
     return torch.randn(30, 10), spirals, torch.rand(30, 6, 2)
 
 
-@pytest.mark.parametrize("name", ["fcs", "lstm"])
+@pytest.mark.parametrize("name", ["fcs", "lstm", "conv"])
 @pytest.mark.parametrize("metric", [False, True])
 def test_scores_have_one_column_per_template_vertex(name, metric, batch):
     features, spirals, extra = batch
@@ -55,7 +61,7 @@ def test_scores_have_one_column_per_template_vertex(name, metric, batch):
     assert scores.shape == (30, 21)
 
 
-@pytest.mark.parametrize("name", ["fcs", "lstm"])
+@pytest.mark.parametrize("name", ["fcs", "lstm", "conv"])
 def test_renumbering_vertices_renumbers_the_scores(name, batch):
     features, spirals, _ = batch
     net = make(name).eval().double()
@@ -65,7 +71,7 @@ def test_renumbering_vertices_renumbers_the_scores(name, batch):
     torch.testing.assert_close(renumbered, net(features.double(), spirals)[order])
 
 
-@pytest.mark.parametrize("name", ["fcs", "lstm"])
+@pytest.mark.parametrize("name", ["fcs", "lstm", "conv"])
 def test_metric_information_must_be_given_if_and_only_if_the_network_reads_it(name, batch):
     features, spirals, extra = batch
     with pytest.raises(ValueError, match="with metric"):
@@ -74,7 +80,7 @@ def test_metric_information_must_be_given_if_and_only_if_the_network_reads_it(na
         make(name)(features, spirals, extra)
 
 
-@pytest.mark.parametrize("name", ["fcs", "lstm"])
+@pytest.mark.parametrize("name", ["fcs", "lstm", "conv"])
 @pytest.mark.parametrize("metric_layers, count", [("all", 3), ("first", 1)])
 def test_metric_information_reaches_the_chosen_layers(name, metric_layers, count, batch):
     features, spirals, extra = batch
@@ -118,7 +124,7 @@ def test_vertices_differ_after_three_layers(cls):
     assert x.std(dim=0).mean() > 0.015
 
 
-@pytest.mark.parametrize("name", ["fcs", "lstm"])
+@pytest.mark.parametrize("name", ["fcs", "lstm", "conv"])
 def test_a_network_is_the_stack_of_its_layers_with_relu_between(name, batch):
     features, spirals, _ = batch
     net = make(name, feature_scale=3.0).eval()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import time
 from pathlib import Path
 
 from meshspiral.experiment.entry import entry_point
@@ -35,18 +36,23 @@ def main(config: EvaluateConfig) -> None:
             epochs,
         )
     settings = retest.config_on_data(trained, requested)
-    retest.check_rotations(config.rotations, settings)
-    predict = Predictor(saved, settings, config.accelerator)
+    retest.check_random("rotations", config.rotations, settings, least=0)
+    retest.check_random("votes", config.votes, settings, least=1)
+    predict = Predictor(saved, settings, config.accelerator, config.votes)
     data = retest.open_test_data(settings, template_of(saved), requested)
     chosen = retest.choose_shapes(config.shapes, data.shapes.names["test"])
 
+    began = time.perf_counter()
     outcome = retest.evaluate(predict, data)
+    seconds = (time.perf_counter() - began) / len(outcome.names)
     values, curve = outcome.metrics()
     metrics = json_ready(values, "test")
-    folder = retest.create_folder(run, settings, trained, requested)
+    folder = retest.create_folder(run, settings, trained, requested, config.votes)
     outcome.save(folder / ERRORS)
     for line in summary.metric_lines(outcome, metrics):
         log.info(line)
+    draws = f", {config.votes} votes" if config.votes > 1 else ""
+    log.info("Seconds:     %.2f per mesh%s", seconds, draws)
     if config.rotations:
         found = retest.evaluate_rotations(predict, data, config.rotations)
         metrics |= json_ready(found.metrics(), "rotations")

@@ -66,6 +66,39 @@ class ReferenceDistances:
             distances[pairs] = self._block(int(block))[sources[pairs] % BLOCK, targets[pairs]]
         return distances
 
+    def heat_kernel(self, width: float) -> tuple[np.ndarray, np.ndarray]:
+        """The heat kernel around every vertex, as a probability distribution over the vertices.
+
+        For short times t the kernel is exp(-d^2 / 4t) of the geodesic distance d (Varadhan 1967);
+        width = sqrt(2t) is its standard deviation. A vertex's probability is the kernel times its
+        share of the area. Vertices beyond three widths are left out.
+
+        Args:
+            width: Over sqrt(template area).
+
+        Returns:
+            Vertices, int64 [K, M], and their probabilities, float32 [K, M]. M is the largest number
+            of vertices within three widths; a row with fewer ends with probabilities of 0.
+        """
+        count, faces = len(self.template.vertices), self.template.faces
+        face_areas = np.linalg.norm(self.template.face_normals, axis=1)
+        areas = np.bincount(faces.ravel(), np.repeat(face_areas, 3), minlength=count)
+        rows = []
+        blocks = range(-(-count // BLOCK))
+        for block in tqdm(blocks, desc="Soft labels", unit="block", leave=False, delay=1.0):
+            for v, distances in enumerate(self._block(block), start=block * BLOCK):
+                near = np.flatnonzero(distances < 3 * width)
+                near = np.union1d(near, [v])
+                weights = np.exp(-0.5 * (distances[near] / width) ** 2) * areas[near]
+                total = weights.sum()
+                rows.append((near, weights / total if total > 0 else 1.0 * (near == v)))
+        longest = max(len(near) for near, _ in rows)
+        vertices = np.zeros((count, longest), np.int64)
+        weights = np.zeros((count, longest), np.float32)
+        for v, (near, probabilities) in enumerate(rows):
+            vertices[v, : len(near)], weights[v, : len(near)] = near, probabilities
+        return vertices, weights
+
     def _block(self, block: int) -> np.ndarray:
         if block not in self._blocks:
             key, compute = f"{self._key}-{block}", partial(self._compute, block)

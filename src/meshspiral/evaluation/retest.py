@@ -65,12 +65,19 @@ def config_on_data(trained: TrainConfig, requested: dict[str, Any]) -> TrainConf
     return read_stored_config(trained.model_dump() | {"data": merged}, "this evaluation")
 
 
-def check_rotations(count: int, config: TrainConfig) -> None:
-    """Raise ConfigError if repetitions are requested of a network without random neighbourhoods."""
+def check_random(key: str, count: int, config: TrainConfig, least: int) -> None:
+    """Raise ConfigError if repetitions are requested of a network without random neighbourhoods.
+
+    Args:
+        key: The setting, for the message.
+        count: Its value.
+        config: The config of the network.
+        least: The value that requests none.
+    """
     neighbourhood = Neighbourhood.of(config.neighbourhood)
-    if count and not neighbourhood.random:
+    if count > least and not neighbourhood.random:
         raise ConfigError(
-            f"rotations must be 0 for {config.model.name}, whose {neighbourhood.noun} are not "
+            f"{key} must be {least} for {config.model.name}, whose {neighbourhood.noun} are not "
             f"random, got {count}"
         )
 
@@ -153,7 +160,11 @@ def predict_mesh(predict: Predict, data: CorrespondenceData, i: int, purpose: st
 
 
 def create_folder(
-    run: Path, config: TrainConfig, trained: TrainConfig, requested: dict[str, Any]
+    run: Path,
+    config: TrainConfig,
+    trained: TrainConfig,
+    requested: dict[str, Any],
+    votes: int = 1,
 ) -> Path:
     """Create the folder of an evaluation, or remove the plots of an earlier one.
 
@@ -162,15 +173,18 @@ def create_folder(
         config: From `config_on_data`.
         trained: The config of the run.
         requested: The data settings that the user gave.
+        votes: Number of draws that vote.
 
     Returns:
         <run>/evaluation/<name of the data set>; with a hash of its settings if another data set
-        than the run's own was requested.
+        than the run's own was requested, and with the number of votes if there are several.
     """
     data, own = (c.data.model_dump(exclude={"cache_dir", "workers"}) for c in (config, trained))
     name = config.data.name
     if "name" in requested and data != own:
         name += f"-{digest(json.dumps(data, sort_keys=True))[:8]}"
+    if votes > 1:
+        name += f"-votes{votes}"
     folder = run / "evaluation" / name
     folder.mkdir(parents=True, exist_ok=True)
     for plot in PLOTS:

@@ -63,6 +63,11 @@ class OptimSettings(Settings):
         description="cosine: up to lr during `warmup`, then down to near 0; or constant"
     )
     warmup: float = Field(ge=0, description="share of all steps before the rate is largest")
+    soft_labels: float | None = Field(
+        gt=0,
+        description="width of a heat kernel that blurs the labels, over the square root of the "
+        "template's area; null: exact labels",
+    )
 
     @field_validator("betas")
     @classmethod
@@ -139,6 +144,7 @@ class EvaluateConfig(Settings):
     rotations: int = Field(
         ge=0, description="100: that many more predictions, each with other random spirals"
     )
+    votes: int = Field(ge=1, description="predict from the mean of so many draws of random spirals")
     shapes: int | list[str] = Field(description="test shapes to draw: how many, or their names")
     accelerator: Accelerator
     threads: Threads
@@ -310,6 +316,8 @@ def upgraded(values: dict[str, Any]) -> dict[str, Any]:
         for key, value in {"dilation": 1, "start": "random", "support": 0.3, "jitter": 0}.items():
             values["neighbourhood"].setdefault(key, value)
     data.setdefault("shuffle_vertices", False)
+    if isinstance(values.get("optim"), dict):
+        values["optim"].setdefault("soft_labels", None)
     values.setdefault("plugins", [])
     values.setdefault("picture", True)
     return values

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
@@ -12,10 +13,41 @@ from meshspiral.nn.precision import add_product, product_dtype
 ROWS = 512  # vertices per chunk; their scores fit in the processor's cache
 
 
-def linear_cross_entropy(x: Tensor, weight: Tensor, bias: Tensor, labels: Tensor) -> Tensor:
+class SoftLabels(NamedTuple):
+    """A probability distribution over the K classes for every label.
+
+    Attributes:
+        classes: Its classes, int64 [K, M]; entries beyond a distribution's size are any class.
+        weights: Their probabilities, float [K, M], with rows of sum 1; 0 beyond.
+    """
+
+    classes: Tensor
+    weights: Tensor
+
+
+class Points(NamedTuple):
+    """Labels that lie between vertices: mixtures of three labels.
+
+    Attributes:
+        corners: The labels, int64 [V, 3].
+        weights: Their shares, float [V, 3], with rows of sum 1.
+    """
+
+    corners: Tensor
+    weights: Tensor
+
+
+def linear_cross_entropy(
+    x: Tensor,
+    weight: Tensor,
+    bias: Tensor,
+    labels: Tensor | Points,
+    soft: SoftLabels | None = None,
+) -> Tensor:
     """Mean cross-entropy of a linear layer, without storing all its scores.
 
-    Equals `F.cross_entropy(F.linear(x, weight, bias), labels)`. The gradients are computed in the
+    Equals `F.cross_entropy(F.linear(x, weight, bias), labels)`; with soft labels, the labels are
+    replaced by their distributions, float [V, K]. The gradients are computed in the
     forward pass, chunk by chunk, so scores take the memory of ROWS rows. Under autocast, products
     are computed in autocast's dtype and sums in float32. Not twice differentiable.
 
@@ -23,17 +55,33 @@ def linear_cross_entropy(x: Tensor, weight: Tensor, bias: Tensor, labels: Tensor
         x: Inputs of the layer, float [V, C].
         weight: float [K, C].
         bias: float [K].
-        labels: Class indices, int64 [V].
+        labels: Class indices, int64 [V], or with `soft` also mixtures of three.
+        soft: The distribution of every label; None for certainty.
 
     Returns:
-        A scalar: the mean over v of -log softmax(x[v] weight^T + bias)[labels[v]].
+        A scalar: the mean over v of -log softmax(x[v] weight^T + bias)[labels[v]], or with `soft`
+        of the mean of this under the label's distribution.
     """
-    return _LinearCrossEntropy.apply(x, weight, bias, labels)
+    return _LinearCrossEntropy.apply(x, weight, bias, labels, soft)
+
+
+def _targets(
+    labels: Tensor | Points, soft: SoftLabels | None, rows: slice, dtype: torch.dtype
+) -> tuple[Tensor, Tensor]:
+    """The classes and probabilities that some rows aim at, int64 [R, M] and float [R, M]."""
+    if soft is None:
+        label = labels[rows, None]
+        return label, torch.ones_like(label, dtype=dtype)
+    if isinstance(labels, Points):
+        corners, shares = labels.corners[rows], labels.weights[rows, :, None].to(dtype)
+        weights = soft.weights[corners].to(dtype) * shares
+        return soft.classes[corners].flatten(1), weights.flatten(1)
+    return soft.classes[labels[rows]], soft.weights[labels[rows]].to(dtype)
 
 
 class _LinearCrossEntropy(torch.autograd.Function):
     @staticmethod
-    def forward(ctx, x, weight, bias, labels):
+    def forward(ctx, x, weight, bias, labels, soft):
         device = x.device.type
         dtype = product_dtype(weight)
         x_low, weight_low = x.detach().to(dtype), weight.detach().to(dtype)
@@ -46,16 +94,16 @@ class _LinearCrossEntropy(torch.autograd.Function):
         with torch.autocast(device, enabled=False):
             for start in range(0, len(x), ROWS):
                 rows = slice(start, start + ROWS)
-                label = labels[rows, None]
+                classes, shares = _targets(labels, soft, rows, sum_dtype)
                 scores = (x_low[rows] @ weight_low.T).to(sum_dtype).add_(bias.detach())
                 scores -= scores.amax(dim=1, keepdim=True)
-                label_score = scores.gather(1, label)
+                label_score = (scores.gather(1, classes) * shares).sum(1, keepdim=True)
                 sums = scores.exp_().sum(dim=1, keepdim=True)
                 loss += (sums.log() - label_score).sum()
                 if not needs_gradient:
                     continue
                 scores /= sums * len(x)  # the gradient of the scores, except at the label
-                scores.scatter_add_(1, label, torch.full_like(label_score, -1.0 / len(x)))
+                scores.scatter_add_(1, classes, shares / -len(x))
                 grad_bias += scores.sum(dim=0)
                 grad = scores.to(dtype)
                 torch.mm(grad, weight_low, out=grad_x[rows])
@@ -73,6 +121,7 @@ class _LinearCrossEntropy(torch.autograd.Function):
                 grad * g.to(grad.dtype) if g.dtype != grad.dtype else g * grad
                 for g in ctx.saved_tensors
             ),
+            None,
             None,
         )
 
@@ -94,14 +143,17 @@ class Prediction(NamedTuple):
 
 
 @torch.no_grad()
-def predict(x: Tensor, weight: Tensor, bias: Tensor, labels: Tensor | None = None) -> Prediction:
+def predict(
+    x: Tensor | Sequence[Tensor], weight: Tensor, bias: Tensor, labels: Tensor | None = None
+) -> Prediction:
     """Predict the class with the largest score x weight^T + bias, in chunks of ROWS rows.
 
     Scores are always in the dtype of `weight`, even under autocast: bf16 has 8 significant bits, so
     many scores would tie, and the tie would go to the lowest class.
 
     Args:
-        x: Inputs of the layer, float [V, C].
+        x: Inputs of the layer, float [V, C]. Of several inputs, the mean of their log-probabilities
+            takes the place of the scores.
         weight: float [K, C].
         bias: float [K].
         labels: Class indices, int64 [V], or None.
@@ -109,6 +161,8 @@ def predict(x: Tensor, weight: Tensor, bias: Tensor, labels: Tensor | None = Non
     Returns:
         The prediction; with labels, also their probabilities and the loss.
     """
+    inputs = [x] if isinstance(x, Tensor) else list(x)
+    x = inputs[0]
     classes = torch.empty(len(x), dtype=torch.int64, device=x.device)
     probability = torch.empty(len(x), dtype=weight.dtype, device=x.device)
     losses = None if labels is None else torch.empty_like(probability)
@@ -116,6 +170,12 @@ def predict(x: Tensor, weight: Tensor, bias: Tensor, labels: Tensor | None = Non
         for start in range(0, len(x), ROWS):
             rows = slice(start, start + ROWS)
             scores = torch.addmm(bias, x[rows].to(weight.dtype), weight.T)
+            if len(inputs) > 1:
+                scores = scores.log_softmax(dim=1)
+                for other in inputs[1:]:
+                    vote = torch.addmm(bias, other[rows].to(weight.dtype), weight.T)
+                    scores += vote.log_softmax(dim=1)
+                scores /= len(inputs)
             best = torch.argmax(scores, dim=1, keepdim=True)
             scores -= scores.gather(1, best)
             label_score = None if labels is None else scores.gather(1, labels[rows, None])

@@ -17,7 +17,7 @@ from meshspiral.experiment.schema import TrainConfig, read_stored_config
 from meshspiral.geometry.digest import derived_seed
 from meshspiral.neighbourhoods import Neighbourhood
 from meshspiral.neighbourhoods.base import Batch
-from meshspiral.nn.loss import Prediction, linear_cross_entropy, predict
+from meshspiral.nn.loss import Points, Prediction, SoftLabels, linear_cross_entropy, predict
 from meshspiral.nn.networks import Network
 
 
@@ -59,6 +59,7 @@ class Correspondence(L.LightningModule):
         self.net: Network = build_network(settings, in_features, num_classes)
         self.optim = settings.optim
         self.seed = settings.seed
+        self.soft_labels: SoftLabels | None = None
         self.errors = nn.ModuleDict({split: CorrespondenceError() for split in ("val", "test")})
         self.metrics: dict[str, dict[str, float]] = {}
         self.curves: dict[str, np.ndarray] = {}
@@ -66,6 +67,9 @@ class Correspondence(L.LightningModule):
 
     def setup(self, stage: str) -> None:
         self.distances = self.trainer.datamodule.reference
+        if stage == "fit" and self.optim.soft_labels is not None:
+            kernel = self.distances.heat_kernel(self.optim.soft_labels)
+            self.soft_labels = SoftLabels(*(torch.from_numpy(x).to(self.device) for x in kernel))
 
     def on_train_batch_start(self, batch: Batch, batch_idx: int) -> None:
         # Dropout depends on seed, epoch and mesh alone, as all other random choices do, so that a
@@ -74,9 +78,11 @@ class Correspondence(L.LightningModule):
 
     def training_step(self, batch: Batch, batch_idx: int) -> Tensor:
         head = self.net.head
-        loss = linear_cross_entropy(
-            self.net.embed_batch(batch), head.weight, head.bias, batch["labels"]
-        )
+        labels = batch["labels"]
+        if self.soft_labels is not None and "corners" in batch:
+            labels = Points(batch["corners"], batch["weights"])
+        x = self.net.embed_batch(batch)
+        loss = linear_cross_entropy(x, head.weight, head.bias, labels, self.soft_labels)
         if self.device.type == "cpu" or batch_idx % CHECK_EVERY == 0:
             self._check_finite(loss, batch_idx)
         self.log("train/loss", loss, on_step=True, on_epoch=True, batch_size=1, sync_dist=True)
@@ -97,10 +103,15 @@ class Correspondence(L.LightningModule):
     def test_step(self, batch: Batch, batch_idx: int) -> None:
         self._evaluate("test", batch)
 
-    def predict(self, batch: Batch) -> Prediction:
-        """Predict a vertex of the template for each vertex; the loss too if there are labels."""
-        head = self.net.head
-        return predict(self.net.embed_batch(batch), head.weight, head.bias, batch.get("labels"))
+    def predict(self, *draws: Batch) -> Prediction:
+        """Predict a vertex of the template for each vertex; the loss too if there are labels.
+
+        Args:
+            *draws: Batches of one mesh with several draws of its neighbourhoods, which vote: the
+                mean of their log-probabilities decides.
+        """
+        head, embedded = self.net.head, [self.net.embed_batch(batch) for batch in draws]
+        return predict(embedded, head.weight, head.bias, draws[0].get("labels"))
 
     def _evaluate(self, split: str, batch: Batch) -> None:
         found = self.predict(batch)

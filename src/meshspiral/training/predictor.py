@@ -23,16 +23,19 @@ class Predictor:
         saved: From `read_checkpoint`.
         config: Its config, from `config_of`; settings of the data set may differ.
         accelerator: "cpu" or "gpu".
+        votes: Number of draws of the neighbourhoods; the mean of their log-probabilities decides.
 
     Raises:
         RunError: The weights do not fit the config.
         ConfigError: There is no GPU.
     """
 
-    def __init__(self, saved: dict[str, Any], config: TrainConfig, accelerator: str = "cpu"):
+    def __init__(
+        self, saved: dict[str, Any], config: TrainConfig, accelerator: str = "cpu", votes: int = 1
+    ):
         self.device = device_of(accelerator)
         self.precision = choose_precision(config.trainer.precision, accelerator)
-        self.seed = config.seed
+        self.seed, self.votes = config.seed, votes
         self.neighbourhood = Neighbourhood.of(config.neighbourhood)
         sizes = (saved["hyper_parameters"][key] for key in ("in_features", "num_classes"))
         self.module = Correspondence(config.model_dump(), *sizes)
@@ -51,12 +54,13 @@ class Predictor:
             purpose: Random choices of the neighbourhoods depend on it and on the run's seed.
         """
         batch = self.module.transfer_batch_to_device(batch, torch.device(self.device), 0)
-        batch = draw(self.neighbourhood, batch, self.seed, "spirals", purpose)
         if self.precision == "64-true":
             batch = {
                 key: value.double() if key in ("features", "vertices", "unit") else value
                 for key, value in batch.items()
             }
+        purposes = [(purpose,), *((purpose, "vote", k) for k in range(1, self.votes))]
+        draws = (draw(self.neighbourhood, batch, self.seed, "spirals", *p) for p in purposes)
         low = torch.autocast(self.device, torch.bfloat16, enabled=self.precision == "bf16-mixed")
         with torch.inference_mode(), low:
-            return self.module.predict(batch)
+            return self.module.predict(*draws)
