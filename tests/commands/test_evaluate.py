@@ -312,9 +312,7 @@ class LabelledWithPoints(ShapeSet):
 @pytest.fixture
 def point_data(tmp_path):
     features = Features((Shot(ShotSettings(radius=0.3, bins=4)),), 0.3)
-    return CorrespondenceData(
-        LabelledWithPoints(), features, neighbourhood, Cache(tmp_path), workers=1
-    )
+    return CorrespondenceData(LabelledWithPoints(), features, spiral(8), Cache(tmp_path), workers=1)
 
 
 @pytest.mark.parametrize("shuffled", [False, True])
