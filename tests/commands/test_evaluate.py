@@ -25,6 +25,7 @@ from meshspiral.experiment.schema import ConfigError
 from meshspiral.training.checkpoints import template_of
 from tests.conftest import toy_shapes
 from tests.helpers import composed, run
+from tests.neighbourhoods.made import spiral
 
 SEED = 3
 REMESH = {"policy": "mixed", "vertices": 120, "copies": 1}
@@ -312,7 +313,8 @@ class LabelledWithPoints(ShapeSet):
 @pytest.fixture
 def point_data(tmp_path):
     features = Features((Shot(ShotSettings(radius=0.3, bins=4)),), 0.3)
-    return CorrespondenceData(LabelledWithPoints(), features, spiral(8), Cache(tmp_path), workers=1)
+    cache = Cache(tmp_path)
+    return CorrespondenceData(LabelledWithPoints(), features, spiral(8), cache, workers=1)
 
 
 @pytest.mark.parametrize("shuffled", [False, True])
