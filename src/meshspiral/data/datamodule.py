@@ -11,6 +11,7 @@ from itertools import chain
 import lightning as L
 import numpy as np
 import torch
+from scipy.sparse import csr_array
 from torch.utils.data import DataLoader, Dataset, Sampler
 from tqdm import tqdm
 
@@ -92,6 +93,37 @@ def neighbourhood_tensors(
     task = frame_task(mesh, support)
     frames = compute_task(task) if cache is None else load_task(task, cache)
     return neighbourhood.tensors(arrays, mesh, frames["frames"])
+
+
+def sequence_points(mesh: Mesh, neighbourhood: Neighbourhood, vertex: int) -> np.ndarray:
+    """The points that the sequence around one vertex visits, as in an evaluation.
+
+    Args:
+        mesh: The surface.
+        neighbourhood: One that gives `spirals`.
+        vertex: The centre.
+
+    Returns:
+        float64 [N, 3], without padding; of the first layer if layers differ.
+
+    Raises:
+        DataError: The neighbourhood gives no sequences.
+    """
+    if neighbourhood.gives != "spirals":
+        raise DataError(f"{neighbourhood.name} has no sequences; it gives {neighbourhood.gives}")
+    arrays = compute_task(neighbourhood_task(mesh, neighbourhood))
+    batch = neighbourhood_tensors(mesh, neighbourhood, arrays)
+    batch = draw(neighbourhood, {**batch, "features": torch.zeros(1), "index": 0}, 0)
+    spirals, places = batch["spirals"], batch.get("places")
+    if isinstance(spirals, tuple):
+        spirals, places = spirals[0], places and places[0]
+    row = spirals[vertex].numpy()
+    row = row[row >= 0]
+    if places is None:
+        return mesh.vertices[row]
+    shape = (len(places["first"]) - 1, len(mesh.vertices))
+    blend = csr_array((places["weights"], places["vertices"], places["first"]), shape=shape)
+    return (blend @ mesh.vertices)[row]
 
 
 class MeshDataset(Dataset):

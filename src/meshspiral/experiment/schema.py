@@ -216,6 +216,31 @@ class MeshesConfig(Settings):
     plugins: Plugins
 
 
+class DrawConfig(Settings):
+    """Settings of `draw`."""
+
+    data: SerializeAsAny[DataSettings]
+    shape: Text | None = Field(description="name of a shape; null: the first test shape")
+    vertex: int = Field(ge=0, description="vertex of the template whose neighbourhoods are drawn")
+    seq_len: int = Field(ge=1, description="number of vertices N of a spiral")
+    neighbourhoods: dict[str, Any] = Field(
+        description="settings of the neighbourhoods to draw, by any name"
+    )
+    output: Text = Field(description="file to write, without its ending")
+    plugins: Plugins
+
+    @field_validator("neighbourhoods", mode="before")
+    @classmethod
+    def _by_name(cls, groups: dict[str, Any]) -> dict[str, Any]:
+        classes, known = {}, registered("neighbourhood")
+        for key, values in groups.items():
+            if _name(values, f"neighbourhoods.{key}") not in known:
+                raise ValueError(f"{key}.name must be one of {', '.join(sorted(known))}")
+            settings = known[values["name"]].Settings
+            classes[key] = _validated(settings, values, f"neighbourhoods.{key}.")
+        return classes
+
+
 class ReportConfig(Settings):
     """Settings of `report`."""
 

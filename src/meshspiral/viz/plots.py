@@ -6,6 +6,7 @@ All functions return a `Figure` that belongs to no window system; save it with `
 from __future__ import annotations
 
 import io
+import textwrap
 from collections.abc import Mapping
 
 import numpy as np
@@ -14,7 +15,10 @@ from matplotlib.cm import ScalarMappable
 from matplotlib.collections import PolyCollection
 from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 
+from meshspiral.geometry.mesh import Mesh
 from meshspiral.viz.colors import ERROR_COLORS, MOST_ERROR
 
 ERROR_LABEL = r"geodesic error / $\sqrt{\mathrm{area}}$"
@@ -173,6 +177,63 @@ def picture_figure(
             scale = ScalarMappable(Normalize(0, 1), ERROR_COLORS.reversed())
             figure.colorbar(scale, cax=axes, label=bar)
     return figure
+
+
+def neighbourhood_figure(
+    panels: list[tuple[str, Mesh, int, np.ndarray]], columns: int = 2
+) -> Figure:
+    """Sequences of points around vertices, each in the tangent plane of its vertex.
+
+    Args:
+        panels: For each panel a title, a mesh, the vertex at the centre, and the points of the
+            sequence, float [N, 3].
+        columns: Number of panels side by side.
+    """
+    rows = -(-len(panels) // columns)
+    figure = Figure(figsize=(4.2 * columns, 4.3 * rows), layout="constrained")
+    reach = 1.15 * max(
+        np.linalg.norm(p - mesh.vertices[v], axis=1).max() for _, mesh, v, p in panels
+    )
+    for axes, (title, mesh, v, points) in zip(
+        figure.subplots(rows, columns, squeeze=False).flat, panels, strict=False
+    ):
+        plane = _tangent_plane(mesh.vertex_normals[v])
+        near = np.linalg.norm(mesh.vertices - mesh.vertices[v], axis=1) < 1.6 * reach
+        front = (mesh.vertex_normals @ mesh.vertex_normals[v]) > 0
+        flat = (mesh.vertices - mesh.vertices[v]) @ plane.T
+        shown = _connected(mesh.faces[(near & front)[mesh.faces].all(axis=1)], v, len(near))
+        axes.add_collection(
+            PolyCollection(flat[shown], facecolors="#f2f2f2", edgecolors="#b5b5b5", linewidths=0.7)
+        )
+        x, y = ((points - mesh.vertices[v]) @ plane.T).T
+        order = np.arange(len(x))
+        axes.plot(x, y, color="black", linewidth=0.9, zorder=2)
+        axes.scatter(x, y, c=order, cmap="viridis", s=52, zorder=3)
+        for i in order[:: max(1, len(order) // 26)]:
+            color = "white" if i < 0.6 * len(order) else "black"
+            axes.annotate(str(i), (x[i], y[i]), color=color, ha="center", va="center", fontsize=5.5)
+        axes.set(xlim=(-reach, reach), ylim=(-reach, reach))
+        axes.set_title("\n".join(textwrap.wrap(title, 60)), fontsize=8)
+        axes.set_aspect("equal")
+        axes.axis("off")
+    return figure
+
+
+def _connected(faces: np.ndarray, v: int, count: int) -> np.ndarray:
+    """The faces of the connected component of vertex v, int [F, 3]."""
+    edges = faces[:, [0, 1, 1, 2]].reshape(-1, 2)
+    graph = coo_array((np.ones(len(edges)), edges.T), shape=(count, count))
+    component = connected_components(graph, directed=False)[1]
+    return faces[component[faces[:, 0]] == component[v]]
+
+
+def _tangent_plane(normal: np.ndarray) -> np.ndarray:
+    """Two orthonormal rows that span the plane across a normal, float64 [2, 3]; the second one
+    points up, as far as it can."""
+    up = np.eye(3)[1 if abs(normal[1]) < 0.9 else 2]
+    right = np.cross(up, normal)
+    right /= np.linalg.norm(right)
+    return np.stack([right, np.cross(normal, right)])
 
 
 def sketch_figure(points: np.ndarray, faces: np.ndarray, colors: np.ndarray) -> Figure:

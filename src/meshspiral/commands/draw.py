@@ -1,0 +1,56 @@
+"""Draw the neighbourhoods of one vertex: `python -m src.draw data=bodies_mixed`."""
+
+from __future__ import annotations
+
+import logging
+from pathlib import Path
+
+from meshspiral.experiment.entry import entry_point
+from meshspiral.experiment.schema import ConfigError, DrawConfig
+
+log = logging.getLogger(__name__)
+KINDS = ("png", "pdf")
+
+
+@entry_point("draw", DrawConfig)
+def main(config: DrawConfig) -> None:
+    import numpy as np
+
+    from meshspiral.data.datamodule import sequence_points
+    from meshspiral.data.files import write_file
+    from meshspiral.data.remeshed import Remeshed
+    from meshspiral.data.sources import open_shapes
+    from meshspiral.neighbourhoods import Neighbourhood
+    from meshspiral.viz.plots import encoded, neighbourhood_figure
+
+    shapes = open_shapes(config.data)
+    names = [name for split in shapes.names.values() for name in split]
+    name = config.shape or shapes.names["test"][0]
+    if name not in names:
+        raise ConfigError(f"shape must be a shape of the data set, got {name}; see src.meshes")
+    count = len(shapes.template.vertices)
+    if config.vertex >= count:
+        raise ConfigError(f"vertex must be below {count}, the template's size, got {config.vertex}")
+    shapes.prepare([name])
+    drawn = {"as remeshed": shapes.load(name)}
+    if isinstance(shapes, Remeshed):
+        drawn = {"as registered": shapes.source(name)} | drawn
+    else:
+        drawn = {name: drawn["as remeshed"]}
+    wanted, panels = shapes.template.vertices[config.vertex], []
+    for tessellation, shape in drawn.items():
+        apart = np.linalg.norm(shapes.template.vertices[shape.labels] - wanted, axis=1)
+        vertex = int(apart.argmin())
+        for settings in config.neighbourhoods.values():
+            around = Neighbourhood.of(settings)
+            points = sequence_points(shape.mesh, around, vertex)
+            panels.append((f"{tessellation}: {around.title}", shape.mesh, vertex, points))
+    figure = neighbourhood_figure(panels, columns=len(config.neighbourhoods))
+    for kind in KINDS:
+        path = Path(config.output).with_suffix(f".{kind}")
+        write_file(path, encoded(figure, kind))
+        log.info("Written: %s", path)
+
+
+if __name__ == "__main__":
+    main()
