@@ -373,3 +373,11 @@ def test_a_killed_command_resumes(cli, trained, files):
         with np.load(path, allow_pickle=False) as file:
             assert file["template"].shape == (162,)
     assert len(finished()) == 40
+
+
+def test_a_file_with_brackets_in_its_name_is_no_pattern(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    for name in ("a[1].ply", "a1.ply"):
+        (tmp_path / name).touch()
+    assert list(find_sources("a[1].ply", Path("out")).values()) == ["a[1].ply"]
+    assert list(find_sources("a[12].ply", Path("out")).values()) == ["a1.ply"]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import os
 import time
 from pathlib import Path
 
@@ -12,6 +13,7 @@ from meshspiral.data.files import legal_name, write_file
 from meshspiral.data.mesh_files import SUFFIXES
 from meshspiral.data.shapes import DataError
 from meshspiral.experiment.entry import entry_point
+from meshspiral.experiment.quoting import quote
 from meshspiral.experiment.schema import MatchConfig
 
 REFUSED = "refused.txt"
@@ -32,14 +34,15 @@ def name_files(words: list[str]) -> list[str]:
     """`match a.ply b.ply` as `match source=a.ply target=b.ply`.
 
     Args:
-        words: The words of a command line; one with the suffix of a mesh file and no = is a file.
+        words: The words of a command line. One with the suffix of a mesh file is a file, unless it
+            has an = and no file has its name.
     """
     roles = iter(("source", "target"))
     named = []
     for word in words:
-        is_file = "=" not in word and word.lower().endswith(SUFFIXES)
+        is_file = word.lower().endswith(SUFFIXES) and ("=" not in word or os.path.isfile(word))
         role = next(roles, None) if is_file else None
-        named.append(f"{role}='{word}'" if role else word)
+        named.append(f"{role}={quote(word)}" if role else word)
     return named
 
 
