@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import os
 import time
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 from tqdm import tqdm
@@ -20,7 +22,7 @@ REFUSED = "refused.txt"
 CONTENTS = {
     "map.txt": "line i: the target vertex of source vertex i, -1 for none",
     "template.txt": "line i: the template vertex of source vertex i, -1 for none",
-    "match.npz target.npz": "the same, with confidences and points on the template",
+    "match.npz target.npz": "the same, with points on the template and confidences",
     "remarks.txt": "confidences and defects of the meshes",
     "source.ply target.ply": "the meshes; corresponding points have equal colours",
     "transferred.npy transferred.ply transferred.obj": "the target's values, on the source",
@@ -54,9 +56,9 @@ def main(config: MatchConfig) -> None:
 
 def match_one(config: MatchConfig) -> Path:
     """Match one mesh; returns the folder of the results."""
-    from meshspiral.data.scans import open_scan
     from meshspiral.matching.job import MatchJob
-    from meshspiral.matching.writing import remark_lines, write_match, write_target
+    from meshspiral.matching.pair import match_file
+    from meshspiral.matching.writing import remark_lines, write_target
 
     if Path(config.source).is_dir():
         raise DataError(
@@ -69,14 +71,8 @@ def match_one(config: MatchConfig) -> Path:
     folder = Path(config.output or Path("outputs", "matches", legal_name(name)))
     job = MatchJob(config, render=config.picture is not False)
     began = time.perf_counter()
-    scan = open_scan(config.source, config.repair)  # its errors come before any work
-    meshes = 2 if config.target else 1
-    with tqdm(total=meshes, desc="Matching", unit="mesh", leave=False, delay=1.0) as progress:
-        if config.target:
-            job.prepare()
-            progress.update()
-        match = job.label(config.source, scan)
-        write_match(job, match, folder)
+    with stage_bar("target", "source") if config.target else stage_bar("source") as report:
+        match = match_file(job, config.source, folder, report)
     if config.target:
         write_target(job, folder)
     for line in remark_lines(match):
@@ -87,6 +83,26 @@ def match_one(config: MatchConfig) -> Path:
             log.info("  %-36s %s", " ".join(written), content)
     log.info("Seconds:     %.1f", time.perf_counter() - began)
     return folder
+
+
+@contextlib.contextmanager
+def stage_bar(*roles: str) -> Iterator[Callable[[str, str], None]]:
+    """A progress bar over the stages of a match; yields the function to report them to.
+
+    Args:
+        *roles: "source" and "target", in the order in which they are labelled.
+    """
+    from meshspiral.matching.job import STAGES
+
+    stages = [(role, stage) for role in roles for stage in STAGES] + [("source", "writing")]
+    bar_format = "{desc:<24} {n_fmt:>2}/{total_fmt}|{bar}| {elapsed}"
+    with tqdm(total=len(stages), bar_format=bar_format, leave=False, dynamic_ncols=True) as bar:
+
+        def report(role: str, stage: str) -> None:
+            bar.n = max(bar.n, stages.index((role, stage)))  # the source is read first
+            bar.set_description_str(f"{role}: {stage}")
+
+        yield report
 
 
 def match_many(config: MatchConfig) -> Path:
@@ -103,7 +119,8 @@ def match_many(config: MatchConfig) -> Path:
     sources = find_sources(config.sources, folder)
     job = MatchJob(config, render=bool(config.picture))
     if config.target:
-        job.prepare()  # reports mistakes before the work begins
+        with stage_bar("target") as report:
+            job.prepare(report)  # reports mistakes before the work begins
         write_target(job, folder)
     else:
         delete_files(folder, TARGET_FILES)
