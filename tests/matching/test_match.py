@@ -114,9 +114,11 @@ def test_the_bar_shows_the_stages(cli, trained, files, monkeypatch):
     names = list(dict.fromkeys(line.partition("|")[0][:24].strip() for line in shown))
     stages = ["descriptors", "neighbourhoods", "network", "refinement"]
     expected = [f"{role}: {stage}" for role in ("target", "source") for stage in stages]
-    assert [n for n in names if n and "reading" not in n] == [*expected, "source: writing"]
+    reading = ["source: reading", "target: reading"]
+    assert [name for name in names if name] == [*reading, *expected, "source: writing"]
     counts = [int(re.search(r"(\d+)/13", line)[1]) for line in shown]
-    assert counts == sorted(counts) and max(map(len, shown)) <= 80
+    assert list(dict.fromkeys(counts)) == [0, 1, 3, 4, 5, 6, 8, 9, 10, 11, 12]  # none is resampled
+    assert max(map(len, shown)) <= 80
 
 
 def test_a_batch_shows_the_stages_of_its_target(cli, trained, scans):

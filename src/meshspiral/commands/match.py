@@ -94,12 +94,15 @@ def stage_bar(*roles: str) -> Iterator[Callable[[str, str], None]]:
     """
     from meshspiral.matching.job import STAGES
 
-    stages = [(role, stage) for role in roles for stage in STAGES] + [("source", "writing")]
+    reading, *labelling = STAGES
+    stages = [(role, reading) for role in reversed(roles)]  # a source's errors come before any work
+    stages += [(role, stage) for role in roles for stage in labelling]
+    stages += [("source", "writing")] * ("source" in roles)
     bar_format = "{desc:<24} {n_fmt:>2}/{total_fmt}|{bar}| {elapsed}"
     with tqdm(total=len(stages), bar_format=bar_format, leave=False, dynamic_ncols=True) as bar:
 
         def report(role: str, stage: str) -> None:
-            bar.n = max(bar.n, stages.index((role, stage)))  # the source is read first
+            bar.n = stages.index((role, stage))
             bar.set_description_str(f"{role}: {stage}")
 
         yield report
