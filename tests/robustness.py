@@ -106,38 +106,11 @@ def main() -> None:
         print_row(title, [measure(matcher, shapes, reference) for matcher in matchers])
     repaired = [measure(matcher, cases[HOLES], reference, repair=True) for matcher in matchers]
     print_row(f"{HOLES}, repair=true", repaired)
-    for title in ("unchanged", "isotropic, 1,500 vertices", "mixed, 1,500 vertices"):
-        print(f"by confidence, {title}:")
-        print("\n".join(confidence_lines(matchers[0], cases[title], reference)))
 
 
 def print_row(title: str, values: list[tuple[float, float, float]]) -> None:
     columns = (f"{100 * e:8.1f} % {m:7.4f} {s:6.2f} s" for e, m, s in values)
     print(f"{title:44}" + "".join(columns), flush=True)
-
-
-def confidence_lines(
-    matcher: Matcher, shapes: list[Shape], reference: ReferenceDistances
-) -> list[str]:
-    """For each fifth of the range of confidences: its share of the vertices, and their errors."""
-    found = [matcher.label(scan(s.mesh.vertices, s.mesh.faces, s.mesh.name)) for s in shapes]
-    confidence = np.concatenate([labels.confidence for labels in found])
-    errors = np.concatenate(
-        [
-            geodesic_errors(labels.template.astype(np.int64), shape.labels, reference)
-            for labels, shape in zip(found, shapes, strict=True)
-        ]
-    )
-    lines = []
-    for low in (0.0, 0.2, 0.4, 0.6, 0.8):
-        within = (confidence >= low) & (confidence < low + 0.2 + (low == 0.8))
-        if within.any():
-            lines.append(
-                f"  {low:.1f} to {low + 0.2:.1f}: {100 * within.mean():5.1f} % of the "
-                f"vertices, {100 * (errors[within] == 0).mean():5.1f} % exact, "
-                f"{100 * (errors[within] < 0.05).mean():5.1f} % within 0.05"
-            )
-    return lines
 
 
 def measure(

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import errno
 import os
+import re
 import sys
 from pathlib import Path
 
@@ -14,7 +15,10 @@ import trimesh
 
 from meshspiral.commands.match import main
 from meshspiral.data.files import atomic_file
+from meshspiral.experiment.schema import MatchConfig
 from meshspiral.matching.batch import find_sources
+from meshspiral.matching.job import MatchJob
+from meshspiral.matching.pair import match_file
 from tests.conftest import toy_shapes
 from tests.helpers import ROOT, VTK_CRASHES, start, wait_for
 
@@ -24,6 +28,11 @@ SOURCE, TARGET = TOYS["test/0.ply"], TOYS["test/1.ply"]
 
 def export(path, mesh):
     trimesh.Trimesh(mesh.vertices, mesh.faces, process=False).export(path)
+
+
+def ply_property(path, name):
+    """A property of the vertices of a PLY file."""
+    return trimesh.load(path, process=False).metadata["_ply_raw"]["vertex"]["data"][name]
 
 
 @pytest.fixture
@@ -61,11 +70,61 @@ def test_a_pair_is_matched_and_written(cli, trained, files):
     source, target = (
         trimesh.load(folder / f"{name}.ply", process=False) for name in ("source", "target")
     )
+    with np.load(folder / "match.npz", allow_pickle=False) as file:
+        confidence = file["map_confidence"]
+        assert file["near_confidence"].shape == file["confidence"].shape == (162,)
+    assert confidence.shape == (162,) and 0 <= confidence.min() < confidence.max() <= 1
+    np.testing.assert_allclose(ply_property(folder / "source.ply", "confidence"), confidence)
+    with np.load(folder / "target.npz", allow_pickle=False) as file:
+        of_labels = ply_property(folder / "target.ply", "confidence")
+        np.testing.assert_allclose(of_labels, file["near_confidence"])
     np.testing.assert_allclose(source.vertices, SOURCE.vertices, atol=1e-6)
     np.testing.assert_array_equal(source.visual.vertex_colors, target.visual.vertex_colors[match])
-    assert "a.ply, 162 vertices; median confidence" in out
+    assert "source: a.ply, 162 vertices; median map confidence" in out
+    assert "target: b.ply, 162 vertices; median label confidence" in out
     for name in ("correspondence.png", "confidence.png"):
         assert (folder / name).read_bytes().startswith(b"\x89PNG")
+
+
+def test_the_stages_of_a_match_are_reported(trained, files):
+    settings = dict.fromkeys(MatchConfig.model_fields) | {"plugins": [], "accelerator": "cpu"}
+    settings |= {"source": str(files / "a.ply"), "target": str(files / "b.ply")}
+    settings |= {"run": str(trained), "smooth": True, "repair": False, "resample": True}
+    job = MatchJob(MatchConfig(**settings), render=False)
+    stages = []
+    match_file(job, settings["source"], files / "out", lambda *stage: stages.append(stage))
+    labelling = ["resampling", "descriptors", "neighbourhoods", "network", "refinement"]
+    assert stages == [
+        ("source", "reading"),
+        ("target", "reading"),
+        *(("target", stage) for stage in labelling),
+        *(("source", stage) for stage in labelling),
+        ("source", "writing"),
+    ]
+    stages.clear()  # the job keeps its target
+    match_file(job, settings["source"], files / "out", lambda *stage: stages.append(stage))
+    assert {role for role, _ in stages} == {"source"}
+
+
+def test_the_bar_shows_the_stages(cli, trained, files, monkeypatch):
+    monkeypatch.setattr("os.get_terminal_size", lambda *_: os.terminal_size((80, 24)))
+    words = ["a.ply", "b.ply", f"run={trained}", "picture=false", "smooth=true"]
+    _, _, err = cli(*words, program=main)
+    shown = [line.rstrip() for line in re.split("[\r\n]", err) if "|" in line]
+    names = list(dict.fromkeys(line.partition("|")[0][:24].strip() for line in shown))
+    stages = ["descriptors", "neighbourhoods", "network", "refinement"]
+    expected = [f"{role}: {stage}" for role in ("target", "source") for stage in stages]
+    reading = ["source: reading", "target: reading"]
+    assert [name for name in names if name] == [*reading, *expected, "source: writing"]
+    counts = [int(re.search(r"(\d+)/13", line)[1]) for line in shown]
+    assert list(dict.fromkeys(counts)) == [0, 1, 3, 4, 5, 6, 8, 9, 10, 11, 12]  # none is resampled
+    assert max(map(len, shown)) <= 80
+
+
+def test_a_batch_shows_the_stages_of_its_target(cli, trained, scans):
+    words = ["sources=scans/*.ply", "target=b.ply", f"run={trained}", "output=out", "workers=1"]
+    code, _, err = cli(*words, program=main)
+    assert code == 0 and "target: neighbourhoods" in err
 
 
 def test_an_attribute_is_transferred(cli, trained, files):
@@ -373,3 +432,11 @@ def test_a_killed_command_resumes(cli, trained, files):
         with np.load(path, allow_pickle=False) as file:
             assert file["template"].shape == (162,)
     assert len(finished()) == 40
+
+
+def test_a_file_with_brackets_in_its_name_is_no_pattern(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    for name in ("a[1].ply", "a1.ply"):
+        (tmp_path / name).touch()
+    assert list(find_sources("a[1].ply", Path("out")).values()) == ["a[1].ply"]
+    assert list(find_sources("a[12].ply", Path("out")).values()) == ["a1.ply"]

@@ -5,7 +5,7 @@ import torch
 from torch.nn import functional as F
 
 from meshspiral.neighbourhoods.patch import by_rows_and_columns
-from meshspiral.nn.geodesic import GeodesicConv, Resampling, resample
+from meshspiral.nn.geodesic import GeodesicConv, Resampling, _fourier_basis, resample
 
 RINGS, RAYS = 5, 16
 
@@ -142,3 +142,14 @@ def test_autocast_changes_values_and_gradients_by_little():
     for a, b in zip(*grads, strict=True):
         assert a.dtype == torch.float32
         assert (a - b).norm() < 0.1 * b.norm()  # nearly equal rotations may swap
+
+
+def test_a_network_can_be_trained_after_another_has_predicted():
+    """Cached tables must not be inference tensors, which autograd refuses."""
+    _fourier_basis.cache_clear()
+    layer, table = GeodesicConv(7, 9, RINGS, RAYS).double(), as_resampling(*patches(31))
+    features = torch.randn(31, 7, dtype=torch.float64)
+    with torch.inference_mode():
+        layer(features, table)
+    layer(features, table).sum().backward()
+    assert torch.isfinite(layer.weight.grad).all()

@@ -19,8 +19,10 @@ from meshspiral.commands.report import main
 from meshspiral.experiment.run_folder import CONFIG, METRICS
 from meshspiral.nn.networks import FCSNet, Network
 from meshspiral.reporting.groups import data_labels, group_runs, length_keys, varied_settings
+from meshspiral.reporting.page import page_html
 from meshspiral.reporting.plots import compared_curves, file_name
 from meshspiral.reporting.runs import Run, common_folder, read_runs
+from meshspiral.reporting.scenes import Scenes
 from meshspiral.reporting.tables import run_table
 from tests.conftest import toy_shapes
 from tests.helpers import QUICK, run
@@ -71,6 +73,30 @@ class Page(HTMLParser):
             self.rows[-1][-1] += data.strip()
         if self._in == "data":
             self.data += data
+
+
+def test_rare_columns_wait_for_a_checkbox(sweep):
+    """So that the table fits 1300 pixels; the checkbox works without scripts."""
+    optims = [
+        {"lr": 0.1 + i, "warmup": 0.1 * i, "epochs": 7 + i, "betas": [0.1 * i, 0]} for i in range(4)
+    ]
+    runs = read_runs(str(sweep))[0]
+    runs = [changed(run, optim=optim) for run, optim in zip(runs, optims, strict=False)]
+    groups = group_runs([*runs, changed(runs[0], seed=5)])
+    text = page_html(groups, [], {}, Scenes(), [])
+    columns, _ = run_table(groups)
+    shown = [*columns[:5], "optim.betas", "optim.epochs", "optim.lr", *columns[9:12]]
+    for table, seeds in zip(text.split("<table")[1:], ("seed", "seeds"), strict=True):
+        heads = re.findall(r'<th(?: class="(\w+)")?>(?:<button>)?([^<]*)', table)
+        visible = [name for kind, name in heads if kind != "rare"]
+        assert visible == [seeds if name == "seed" else name for name in shown]
+        for row in table.split("<tbody>")[1].split("</tr>")[:-1]:
+            hidden = ['class="rare"' in cell for cell in row.split("<td")[1:]]
+            assert hidden == [kind == "rare" for kind, _ in heads]
+    checkbox = text.index('<input type="checkbox" id="all">')
+    assert checkbox < text.index("<table") and "#all:not(:checked) ~ .wide .rare" in text
+    folder = str(runs[0].folder)
+    assert f'<tr title="{folder}">' in text  # which run a row shows
 
 
 def changed(run: Run, **groups: dict) -> Run:

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import logging
+import os
 import time
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 from tqdm import tqdm
@@ -12,13 +15,14 @@ from meshspiral.data.files import legal_name, write_file
 from meshspiral.data.mesh_files import SUFFIXES
 from meshspiral.data.shapes import DataError
 from meshspiral.experiment.entry import entry_point
+from meshspiral.experiment.quoting import quote
 from meshspiral.experiment.schema import MatchConfig
 
 REFUSED = "refused.txt"
 CONTENTS = {
     "map.txt": "line i: the target vertex of source vertex i, -1 for none",
     "template.txt": "line i: the template vertex of source vertex i, -1 for none",
-    "match.npz target.npz": "the same, with confidences and points on the template",
+    "match.npz target.npz": "the same, with points on the template and confidences",
     "remarks.txt": "confidences and defects of the meshes",
     "source.ply target.ply": "the meshes; corresponding points have equal colours",
     "transferred.npy transferred.ply transferred.obj": "the target's values, on the source",
@@ -32,14 +36,15 @@ def name_files(words: list[str]) -> list[str]:
     """`match a.ply b.ply` as `match source=a.ply target=b.ply`.
 
     Args:
-        words: The words of a command line; one with the suffix of a mesh file and no = is a file.
+        words: The words of a command line. One with the suffix of a mesh file is a file, unless it
+            has an = and no file has its name.
     """
     roles = iter(("source", "target"))
     named = []
     for word in words:
-        is_file = "=" not in word and word.lower().endswith(SUFFIXES)
+        is_file = word.lower().endswith(SUFFIXES) and ("=" not in word or os.path.isfile(word))
         role = next(roles, None) if is_file else None
-        named.append(f"{role}='{word}'" if role else word)
+        named.append(f"{role}={quote(word)}" if role else word)
     return named
 
 
@@ -51,9 +56,9 @@ def main(config: MatchConfig) -> None:
 
 def match_one(config: MatchConfig) -> Path:
     """Match one mesh; returns the folder of the results."""
-    from meshspiral.data.scans import open_scan
     from meshspiral.matching.job import MatchJob
-    from meshspiral.matching.writing import remark_lines, write_match, write_target
+    from meshspiral.matching.pair import match_file
+    from meshspiral.matching.writing import remark_lines, write_target
 
     if Path(config.source).is_dir():
         raise DataError(
@@ -66,14 +71,8 @@ def match_one(config: MatchConfig) -> Path:
     folder = Path(config.output or Path("outputs", "matches", legal_name(name)))
     job = MatchJob(config, render=config.picture is not False)
     began = time.perf_counter()
-    scan = open_scan(config.source, config.repair)  # its errors come before any work
-    meshes = 2 if config.target else 1
-    with tqdm(total=meshes, desc="Matching", unit="mesh", leave=False, delay=1.0) as progress:
-        if config.target:
-            job.prepare()
-            progress.update()
-        match = job.label(config.source, scan)
-        write_match(job, match, folder)
+    with stage_bar("target", "source") if config.target else stage_bar("source") as report:
+        match = match_file(job, config.source, folder, report)
     if config.target:
         write_target(job, folder)
     for line in remark_lines(match):
@@ -84,6 +83,29 @@ def match_one(config: MatchConfig) -> Path:
             log.info("  %-36s %s", " ".join(written), content)
     log.info("Seconds:     %.1f", time.perf_counter() - began)
     return folder
+
+
+@contextlib.contextmanager
+def stage_bar(*roles: str) -> Iterator[Callable[[str, str], None]]:
+    """A progress bar over the stages of a match; yields the function to report them to.
+
+    Args:
+        *roles: "source" and "target", in the order in which they are labelled.
+    """
+    from meshspiral.matching.job import STAGES
+
+    reading, *labelling = STAGES
+    stages = [(role, reading) for role in reversed(roles)]  # a source's errors come before any work
+    stages += [(role, stage) for role in roles for stage in labelling]
+    stages += [("source", "writing")] * ("source" in roles)
+    bar_format = "{desc:<24} {n_fmt:>2}/{total_fmt}|{bar}| {elapsed}"
+    with tqdm(total=len(stages), bar_format=bar_format, leave=False, dynamic_ncols=True) as bar:
+
+        def report(role: str, stage: str) -> None:
+            bar.n = stages.index((role, stage))
+            bar.set_description_str(f"{role}: {stage}")
+
+        yield report
 
 
 def match_many(config: MatchConfig) -> Path:
@@ -100,7 +122,8 @@ def match_many(config: MatchConfig) -> Path:
     sources = find_sources(config.sources, folder)
     job = MatchJob(config, render=bool(config.picture))
     if config.target:
-        job.prepare()  # reports mistakes before the work begins
+        with stage_bar("target") as report:
+            job.prepare(report)  # reports mistakes before the work begins
         write_target(job, folder)
     else:
         delete_files(folder, TARGET_FILES)

@@ -27,6 +27,7 @@ from meshspiral.data.shapes import DataError
 from meshspiral.experiment.compose import CONF, known_keys
 from meshspiral.experiment.help import settings_help
 from meshspiral.experiment.program import command_line
+from meshspiral.experiment.quoting import quote_words
 from meshspiral.experiment.run_folder import RunError, Stopped
 from meshspiral.experiment.schema import MOVED, ConfigError, read_config
 from meshspiral.experiment.sweeps import invocation, note_failure, number_unfinished, show_table
@@ -73,7 +74,7 @@ def entry_point(
             if hint := dashed_setting(sys.argv[1:], schema):
                 print(f"error: {hint}", file=sys.stderr)
                 sys.exit(2)
-            sys.argv[1:] = rewrite(sys.argv[1:])
+            sys.argv[1:] = quote_words(rewrite(sys.argv[1:]), schema)
             with invocation(sys.argv[1:]) as call:
                 try:
 
@@ -180,6 +181,14 @@ def one_line(error: BaseException) -> str:
         if lines[0].startswith(("mismatched input", "token recognition", "no viable")):
             hint = "; a value with = or spaces needs quotes of its own: \"source='a b=c.ply'\""
             return lines[0] + hint
+        if ambiguous := re.match(r"Ambiguous value for argument '(([^=]+)=(.*))'$", lines[0]):
+            word, key, value = ambiguous.groups()
+            return (
+                f"{word} is several values; as one value: \"{key}='{value}'\", as a list: "
+                f"'{key}=[{value}]', as a sweep: -m {word}"
+            )
+        if lines[0].startswith("Interpolation key"):
+            return lines[0] + "; where ${ is part of a name, write \\${"
         for old, new in MOVED.items():
             if f"'{old}" in lines[0]:
                 return f"{lines[0]} {old} is {new} now"

@@ -104,6 +104,7 @@ def find_sources(pattern: str, output: Path) -> dict[str, str]:
 
     Args:
         pattern: As for `glob.glob`; ** matches folders at any depth. Or a folder: all files in it.
+            Or a file, whatever characters its name has.
         output: Files in this folder are left out: they are results.
 
     Returns:
@@ -112,7 +113,10 @@ def find_sources(pattern: str, output: Path) -> dict[str, str]:
     Raises:
         DataError: No mesh file matches.
     """
-    matches = os.path.join(glob.escape(pattern), "*") if os.path.isdir(pattern) else pattern
+    matches = pattern
+    if os.path.exists(pattern):  # a name with brackets is no pattern
+        matches = glob.escape(pattern)
+        matches = os.path.join(matches, "*") if os.path.isdir(pattern) else matches
     paths = sorted(
         path
         for path in glob.glob(matches, recursive=True)

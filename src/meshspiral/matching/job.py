@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
-from functools import cached_property, lru_cache
+from functools import cached_property, lru_cache, partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -16,14 +16,20 @@ from meshspiral.experiment.run_folder import BEST
 from meshspiral.experiment.schema import MatchConfig, read_config
 from meshspiral.geometry.digest import digest
 from meshspiral.geometry.mesh import MeshError
-from meshspiral.matching.matcher import BUNDLED_RUN, Labels, Matcher, nearest_vertices
+from meshspiral.matching.confidence import Distributions
+from meshspiral.matching.matcher import BUNDLED_RUN, MESH_STAGES, Labels, Matcher, nearest_vertices
+
+CONTENT = "map_confidence"  # part of the key: earlier versions wrote less, so it is done anew
+STAGES = ("reading", *MESH_STAGES)  # of a mesh file
+FileReport = Callable[[str, str], None]  # is told "source" or "target", and a stage that begins
 
 
 class LabelledScan(NamedTuple):
-    """A scan and the labels of its V vertices."""
+    """A scan, the labels of its V vertices, and what they were chosen from."""
 
     scan: Scan
     labels: Labels
+    distributions: Distributions
 
     def on_mesh(self, values: np.ndarray) -> np.ndarray:
         """Values of the W vertices of `scan.mesh`, [W, ...], from those of the V, [V, ...]."""
@@ -38,12 +44,19 @@ class FileMatch(NamedTuple):
         source: The source and its labels.
         target: The target and its labels; None without a target.
         map: int32 [V], for each source vertex a target vertex or -1; None without a target.
+        confidence: float32 [V], `confidence` of `Match`; None without a target.
     """
 
     path: str
     source: LabelledScan
     target: LabelledScan | None
     map: np.ndarray | None
+    confidence: np.ndarray | None
+
+    @property
+    def source_confidence(self) -> np.ndarray:
+        """The confidence to show, float32 [V]: that of the map, or near the template's vertices."""
+        return self.source.labels.near_confidence if self.confidence is None else self.confidence
 
 
 class MatchJob:
@@ -75,10 +88,22 @@ class MatchJob:
     @cached_property
     def target(self) -> LabelledScan | None:
         """The labelled target. Raises MeshError as `open_scan` and `Matcher.label` do."""
+        return self._read_target(None)
+
+    def _read_target(self, report: FileReport | None) -> LabelledScan | None:
         if self.config.target is None:
             return None
-        scan = open_scan(self.config.target, self.config.repair)
-        return LabelledScan(scan, self.matcher.label(scan))
+        return self._label_scan(self.read(self.config.target, report, "target"), report, "target")
+
+    def read(self, path: str, report: FileReport | None = None, role: str = "source") -> Scan:
+        """Read a mesh file, repaired on request. Raises MeshError as `open_scan` does."""
+        if report:
+            report(role, "reading")
+        return open_scan(path, self.config.repair)
+
+    def _label_scan(self, scan: Scan, report: FileReport | None, role: str) -> LabelledScan:
+        of_role = partial(report, role) if report else None
+        return LabelledScan(scan, *self.matcher.predict(scan, of_role))
 
     @cached_property
     def transfer_values(self) -> np.ndarray | None:
@@ -88,9 +113,11 @@ class MatchJob:
         vertices = len(self.target.scan.vertices)
         return read_attribute(self.config.target, self.config.transfer, vertices)
 
-    def prepare(self) -> None:
+    def prepare(self, report: FileReport | None = None) -> None:
         """Label the target and read the values to transfer, so that their errors come first."""
-        _ = self.target, self.transfer_values
+        if "target" not in vars(self):
+            self.target = self._read_target(report)
+        _ = self.transfer_values
 
     @property
     def inputs(self) -> list[str]:
@@ -98,19 +125,23 @@ class MatchJob:
         array = None if self.config.transfer in KINDS else self.config.transfer
         return [path for path in (self.config.target, array) if path]
 
-    def label(self, path: str, scan: Scan) -> FileMatch:
+    def label(self, path: str, scan: Scan, report: FileReport | None = None) -> FileMatch:
         """Label a source, and match it to the target if there is one.
 
         Args:
             path: The source's file.
             scan: Its content.
+            report: Called with each stage.
 
         Raises:
             MeshError: The mesh cannot be described, resampled or smoothed.
         """
-        source, target = LabelledScan(scan, self.matcher.label(scan)), self.target
-        match = nearest_vertices(source.labels, target.labels) if target else None
-        return FileMatch(path, source, target, match)
+        source, target = self._label_scan(scan, report, "source"), self.target
+        if target is None:
+            return FileMatch(path, source, None, None, None)
+        match = nearest_vertices(source.labels, target.labels)
+        found = source.distributions, target.distributions
+        return FileMatch(path, source, target, match, self.matcher.map_confidence(*found, match))
 
     def key(self, path: str) -> str:
         """A hash of all that a match depends on: the source's content, inputs and settings.
@@ -125,7 +156,7 @@ class MatchJob:
         config = self.config
         files = [str(Path(config.run or BUNDLED_RUN) / BEST), *self.inputs]
         settings = config.repair, config.resample, config.smooth, config.transfer, self.render
-        return digest(*map(_content, files), *settings)
+        return digest(*map(_content, files), *settings, CONTENT)
 
 
 @lru_cache(maxsize=1)

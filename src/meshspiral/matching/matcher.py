@@ -7,16 +7,19 @@ match.target[v]  # the vertex of b that corresponds to vertex v of a
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import cached_property
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 import torch
+from scipy.sparse import csr_array
 from scipy.spatial import cKDTree
 
-from meshspiral.data.datamodule import mesh_tensors
+from meshspiral.data.datamodule import described_tensors, neighbourhood_tensors
 from meshspiral.data.descriptors import Features
+from meshspiral.data.preprocessing import compute_task, descriptor_task, neighbourhood_task
 from meshspiral.data.scans import Scan
 from meshspiral.experiment.run_folder import BEST
 from meshspiral.experiment.schema import TrainConfig
@@ -24,10 +27,18 @@ from meshspiral.geometry.barycentric import interpolate
 from meshspiral.geometry.mesh import Mesh
 from meshspiral.geometry.resample import resample
 from meshspiral.geometry.zoomout import TO, eigenfunctions, zoomout
+from meshspiral.matching.confidence import (
+    Distributions,
+    map_confidence,
+    near_confidence,
+    near_vertices,
+)
 from meshspiral.training.checkpoints import config_of, read_checkpoint, template_of
 from meshspiral.training.predictor import Predictor
 
 BUNDLED_RUN = Path(__file__).parents[1] / "data" / "assets" / "bodies_run"
+MESH_STAGES = ("resampling", "descriptors", "neighbourhoods", "network", "refinement")
+Report = Callable[[str], None]  # is told each stage when it begins; not every mesh has all
 NEAR = 5.0  # mean edges of the template; labels further apart are not interpolated
 
 
@@ -40,11 +51,17 @@ class Labels(NamedTuple):
             length; NaN at a vertex on no face.
         confidence: float32 [V], the predicted probability of `template`, in 0..1; 0 at a vertex on
             no face.
+        near_confidence: float32 [V], the predicted probability that the true vertex of the template
+            is at most 0.05 sqrt(area) from `template`; 0 at a vertex on no face.
+
+    On meshes unlike those of training, all probabilities are too high; docs/reliability.md says
+    what was measured.
     """
 
     template: np.ndarray
     points: np.ndarray
     confidence: np.ndarray
+    near_confidence: np.ndarray | None = None
 
 
 class Match(NamedTuple):
@@ -54,11 +71,14 @@ class Match(NamedTuple):
         target: int32 [V], the corresponding vertex of the target; -1 for none.
         source_labels: The labels of the source.
         target_labels: The labels of the target.
+        confidence: float32 [V], the predicted probability that the match is right up to 0.05
+            sqrt(area) on the template, see `meshspiral.matching.confidence`; 0 for none.
     """
 
     target: np.ndarray
     source_labels: Labels
     target_labels: Labels
+    confidence: np.ndarray
 
 
 class Matcher:
@@ -126,20 +146,39 @@ class Matcher:
         Raises:
             MeshError: The mesh cannot be described, resampled or smoothed.
         """
+        return self.predict(scan)[0]
+
+    def predict(self, scan: Scan, report: Report | None = None) -> tuple[Labels, Distributions]:
+        """Label a mesh, as `label` does; also returns what the labels were chosen from.
+
+        Args:
+            scan: From `open_scan` or `scan`.
+            report: Called with each of MESH_STAGES that the mesh needs.
+
+        Raises:
+            MeshError: The mesh cannot be described, resampled or smoothed.
+        """
+        report = report or (lambda stage: None)
         mesh = normalize(scan.mesh)
         if self._needs_resampling(len(mesh.vertices)):
+            report("resampling")
             coarse = resample(mesh, self._training_size)
-            template, confidence = self._predict(coarse.mesh)
+            template, confidence, embedding = self._predict(coarse.mesh, report)
             nearest = coarse.corners[np.arange(len(mesh.vertices)), coarse.weights.argmax(axis=1)]
             points = self._interpolate(template[coarse.corners], coarse.weights, template[nearest])
             template, confidence = template[nearest], confidence[nearest]
         else:
-            template, confidence = self._predict(mesh)
-            points = self.template.vertices[template]
+            template, confidence, embedding = self._predict(mesh, report)
+            points, nearest = self.template.vertices[template], np.arange(len(template))
         missing = scan.vertex_of < 0
-        template, confidence, points = (x[scan.vertex_of] for x in (template, confidence, points))
+        template, confidence, points, row_of = (
+            values[scan.vertex_of] for values in (template, confidence, points, nearest)
+        )
         template[missing], confidence[missing], points[missing] = -1, 0.0, np.nan
-        return Labels(template.astype(np.int32), points, confidence)
+        row_of[missing] = -1
+        distributions = Distributions(embedding, *self._predictor.head, row_of)
+        around = near_confidence(distributions, template, self._near_vertices)
+        return Labels(template.astype(np.int32), points, confidence, around), distributions
 
     def match(self, source: Scan, target: Scan) -> Match:
         """Map the vertices of a source to those of a target.
@@ -147,8 +186,22 @@ class Matcher:
         Raises:
             MeshError: A mesh cannot be described, resampled or smoothed.
         """
-        labels = self.label(source), self.label(target)
-        return Match(nearest_vertices(*labels), *labels)
+        (labels, found), (target_labels, target_found) = self.predict(source), self.predict(target)
+        match = nearest_vertices(labels, target_labels)
+        confidence = self.map_confidence(found, target_found, match)
+        return Match(match, labels, target_labels, confidence)
+
+    def map_confidence(
+        self, source: Distributions, target: Distributions, match: np.ndarray
+    ) -> np.ndarray:
+        """`confidence` of `Match`, float32 [V].
+
+        Args:
+            source: From `predict`, of V vertices.
+            target: From `predict`.
+            match: int [V], a target vertex for every source vertex; -1 for none.
+        """
+        return map_confidence(source, target, match, self._near_vertices)
 
     def _needs_resampling(self, vertices: int) -> bool:
         if self._resampled is not None:
@@ -156,24 +209,34 @@ class Matcher:
         factor = self._predictor.neighbourhood.density_range
         return not self._training_size / factor <= vertices <= self._training_size * factor
 
-    def _predict(self, mesh: Mesh) -> tuple[np.ndarray, np.ndarray]:
+    def _predict(self, mesh: Mesh, report: Report) -> tuple[np.ndarray, np.ndarray, torch.Tensor]:
         """Predict for each vertex of a mesh a template vertex and its probability.
 
         Args:
             mesh: W vertices, normalized.
+            report: As for `predict`.
 
         Returns:
-            Vertices of the template, int64 [W], and their probabilities, float32 [W].
+            Vertices of the template, int64 [W], their probabilities, float32 [W], and the input of
+            the network's last layer, [W, C].
         """
-        batch = mesh_tensors(mesh, self._features, self._predictor.neighbourhood)
+        report("descriptors")
+        described = [compute_task(descriptor_task(mesh, d)) for d in self._features.descriptors]
+        batch = described_tensors(described, mesh, self._features)
+        report("neighbourhoods")
+        neighbourhood = self._predictor.neighbourhood
+        arrays = compute_task(neighbourhood_task(mesh, neighbourhood))
+        batch |= neighbourhood_tensors(mesh, neighbourhood, arrays)
         batch["index"] = 0
-        prediction = self._predictor(batch, "evaluation")
+        report("network")
+        embedding = self._predictor.embed(batch, "evaluation")
+        prediction = self._predictor.predict(embedding)
         template, confidence = prediction.classes.cpu().numpy(), prediction.probability
         if self._smooth:
+            report("refinement")
             template = zoomout(*eigenfunctions(mesh, TO), self._eigenfunctions, template)
-            batch["labels"] = torch.from_numpy(template)
-            confidence = self._predictor(batch, "evaluation").of_label
-        return template, confidence.float().cpu().numpy()
+            confidence = self._predictor.predict(embedding, torch.from_numpy(template)).of_label
+        return template, confidence.float().cpu().numpy(), embedding
 
     def _interpolate(
         self, corners: np.ndarray, weights: np.ndarray, nearest: np.ndarray
@@ -200,6 +263,10 @@ class Matcher:
         a, b, c = (self.template.vertices[self.template.faces[:, i]] for i in range(3))
         edges = np.concatenate([b - a, c - b, a - c])
         return NEAR * float(np.linalg.norm(edges, axis=1).mean())
+
+    @cached_property
+    def _near_vertices(self) -> csr_array:
+        return near_vertices(self.template)
 
     @cached_property
     def _eigenfunctions(self) -> np.ndarray:

@@ -24,7 +24,7 @@ def draw_pictures(folder: Path, match: FileMatch, template: Mesh, up: str, requi
     """Render correspondence.png and confidence.png.
 
     Both show the target, or the template without one, and beside it the source, in the template's
-    pose.
+    pose. The confidence is that of the map at the source, and that of the labels at the target.
 
     Args:
         folder: Where to write them.
@@ -42,13 +42,13 @@ def draw_pictures(folder: Path, match: FileMatch, template: Mesh, up: str, requi
         source_colors = transfer(target_colors, match.map, GREY)
         colors = [target.on_mesh(target_colors), source.on_mesh(source_colors)]
         meshes = [align_to_template(target, template), align_to_template(source, template)]
-        confidences = [target.on_mesh(target.labels.confidence)]
+        confidences = [target.on_mesh(target.labels.near_confidence)]
     else:
         source_colors = point_colors(template, source.labels.points)
         colors = [template_colors(template), source.on_mesh(source_colors)]
         meshes = [template, align_to_template(source, template)]
         confidences = [np.ones(len(template.vertices))]
-    confidences.append(source.on_mesh(source.labels.confidence))
+    confidences.append(source.on_mesh(match.source_confidence))
     rows = [Row(meshes, colors), Row(meshes, [confidence_colors(c) for c in confidences])]
     try:
         correspondence, confidence = render(rows, up)

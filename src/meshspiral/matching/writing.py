@@ -51,17 +51,17 @@ def write_match(job: MatchJob, match: FileMatch, folder: Path) -> None:
     _check_owner(folder, match.path)
     folder.mkdir(parents=True, exist_ok=True)
     delete_files(folder, SOURCE_FILES if match.target else SOURCE_FILES + TARGET_FILES)
-    template, (scan, labels) = job.matcher.template, match.source
+    template, scan, labels = job.matcher.template, match.source.scan, match.source.labels
     arrays = labels._asdict()
     if match.target:
-        arrays["map"] = match.map
+        arrays |= {"map": match.map, "map_confidence": match.confidence}
         write_integers(folder / "map.txt", match.map)
         colors = transfer(own_colors(match.target.scan), match.map, GREY)
     else:
         colors = point_colors(template, labels.points)
     write_integers(folder / "template.txt", labels.template)
     write_file(folder / "remarks.txt", "\n".join(remark_lines(match)) + "\n")
-    write_colored_mesh(folder / "source.ply", scan, colors)
+    write_colored_mesh(folder / "source.ply", scan, colors, match.source_confidence)
     if job.transfer_values is not None:
         values = transfer(job.transfer_values, match.map, 0)
         write_transferred(folder, scan, values, job.config.transfer)
@@ -81,9 +81,9 @@ def write_target(job: MatchJob, folder: Path) -> None:
     """
     check_inputs(folder, *job.inputs)
     folder.mkdir(parents=True, exist_ok=True)
-    scan, labels = job.target
+    scan, labels = job.target.scan, job.target.labels
     write_arrays(folder / "target.npz", **labels._asdict())
-    write_colored_mesh(folder / "target.ply", scan, own_colors(scan))
+    write_colored_mesh(folder / "target.ply", scan, own_colors(scan), labels.near_confidence)
 
 
 def is_finished(job: MatchJob, path: str, folder: Path) -> bool:
@@ -130,13 +130,18 @@ def delete_files(folder: Path, names: tuple[str, ...]) -> None:
 def remark_lines(match: FileMatch) -> list[str]:
     """Confidence and remarks of source and target, as lines of text."""
     lines = []
-    for role, labelled in (("source", match.source), ("target", match.target)):
+    source_kind = "label" if match.confidence is None else "map"
+    for role, labelled, kind, confidence in (
+        ("source", match.source, source_kind, match.source_confidence),
+        ("target", match.target, "label", match.target and match.target.labels.near_confidence),
+    ):
         if labelled is not None:
-            scan, labels = labelled
-            confidence = labels.confidence[labels.template >= 0]
+            scan, labels = labelled.scan, labelled.labels
+            confidence = confidence[labels.template >= 0]
             lines.append(
-                f"{role}: {scan.mesh.name}, {len(scan.vertices):,} vertices; median confidence "
-                f"{np.median(confidence):.2f}, below 0.1 at {100 * (confidence < 0.1).mean():.1f} %"
+                f"{role}: {scan.mesh.name}, {len(scan.vertices):,} vertices; median {kind} "
+                f"confidence {np.median(confidence):.2f}, below 0.5 at "
+                f"{100 * (confidence < 0.5).mean():.1f} %"
             )
             lines += [f"  {remark}" for remark in scan.remarks]
     return lines
@@ -147,15 +152,17 @@ def write_integers(path: Path, integers: np.ndarray) -> None:
     write_file(path, "\n".join(map(str, integers.tolist())) + "\n")
 
 
-def write_colored_mesh(path: Path, scan: Scan, colors: np.ndarray) -> None:
-    """Write the user's mesh as a PLY file with vertex colours.
+def write_colored_mesh(path: Path, scan: Scan, colors: np.ndarray, confidence: np.ndarray) -> None:
+    """Write the user's mesh as a PLY file with vertex colours and the vertex property confidence.
 
     Args:
         path: The file.
         scan: The mesh.
         colors: float [V, 3] in 0..1.
+        confidence: float32 [V] in 0..1.
     """
     mesh = _user_mesh(scan, vertex_colors=np.round(255 * colors).astype(np.uint8))
+    mesh.vertex_attributes["confidence"] = confidence
     write_file(path, mesh.export(file_type="ply"))
 
 

@@ -131,6 +131,7 @@ class GeodesicConv(nn.Module):
 
 
 @cache
+@torch.inference_mode(False)  # or a network could not be trained after another has predicted
 def _fourier_basis(rays: int, dtype: torch.dtype, device: torch.device) -> Tensor:
     """The orthonormal real Fourier basis, float [rays, rays].
 

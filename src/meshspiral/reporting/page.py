@@ -11,10 +11,15 @@ import numpy as np
 from jinja2 import Environment, FileSystemLoader
 from plotly.offline import get_plotlyjs
 
-from meshspiral.reporting.groups import Group, format_value
+from meshspiral.reporting.groups import Group, format_value, other_keys
 from meshspiral.reporting.scenes import Scenes
 from meshspiral.reporting.tables import METRIC_COLUMNS, format_metric, group_table, run_table
 from meshspiral.viz.colors import ERROR_COLORS, MOST_ERROR
+
+# columns that few readers need; a checkbox shows them, or the table would not fit a laptop's screen
+RARE = {METRIC_COLUMNS[key] for key in ("val/exact_match", "parameters", "seconds/train")}
+RARE |= {"folder"}
+MOST_SETTINGS = 3  # columns of varied settings; more of them are rare too
 
 
 def page_html(
@@ -41,10 +46,15 @@ def page_html(
     )
     columns, rows = run_table(groups)
     seed_columns, group_rows = group_table(groups)
+    rare = RARE | set(other_keys(groups)[MOST_SETTINGS:])
     scale = (255 * ERROR_COLORS(np.linspace(0, 1, 256))[:, :3]).round().astype(int).tolist()
     data = json.dumps({"scenes": scenes.scenes, "surfaces": scenes.surfaces, "scale": scale})
     return environment.get_template("page.html").render(
         columns=columns,
+        rare=rare,
+        texts=["data", *other_keys(groups)],
+        rare_names=[name for name in columns if name in rare],
+        folders=[row[columns.index("folder")] for row in rows],
         rows=[[table_cell(*pair) for pair in zip(columns, row, strict=True)] for row in rows],
         seeds=[row for row, group in zip(group_rows, groups, strict=True) if len(group.seeds) > 1],
         seed_columns=seed_columns,
@@ -60,7 +70,8 @@ def page_html(
 
 
 def table_cell(column: str, value: Any) -> dict[str, Any]:
-    """The text of a cell, and the value by which the column is sorted."""
+    """The column and the text of a cell, and the value by which the column is sorted."""
     keys = {name: key for key, name in METRIC_COLUMNS.items()}
     text = format_metric([value], keys[column]) if column in keys else format_value(value)
-    return {"text": text, "sort": value if isinstance(value, int | float) else str(value)}
+    sort = value if isinstance(value, int | float) else str(value)
+    return {"column": column, "text": text, "sort": sort}

@@ -18,6 +18,9 @@ from meshspiral.viz.colors import template_colors
 from meshspiral.viz.plots import curve_figure, sketch_figure
 from meshspiral.viz.render import upright
 
+# fits 80 columns with a bar: no count of steps, no words that the metrics explain
+BAR_FORMAT = "{desc} {percentage:3.0f}%|{bar}| {elapsed}<{remaining}, {rate_fmt}{postfix}"
+
 
 class Bar(ProgressBar):
     """One progress bar for the whole training, with the time left and the latest validation.
@@ -42,23 +45,30 @@ class Bar(ProgressBar):
         self._bar = tqdm(
             total=total,
             initial=trainer.global_step,
-            desc="Training",
+            desc=self._epoch(trainer),
+            bar_format=BAR_FORMAT,
             unit="step",
             mininterval=every,
             disable=not trainer.is_global_zero,
             dynamic_ncols=True,
         )
 
+    def on_train_epoch_start(self, trainer: L.Trainer, module: L.LightningModule) -> None:
+        self._bar.set_description_str(self._epoch(trainer), refresh=False)
+
     def on_train_batch_end(self, trainer, module, outputs, batch, batch_idx) -> None:
         self._bar.update()
+
+    @staticmethod
+    def _epoch(trainer: L.Trainer) -> str:
+        return f"Epoch {min(trainer.current_epoch + 1, trainer.max_epochs)}/{trainer.max_epochs}"
 
     def on_validation_end(self, trainer: L.Trainer, module: L.LightningModule) -> None:
         self._evaluation.close()
         values = trainer.callback_metrics
         if self._bar is not None and "val/exact_match" in values:
             self._bar.set_postfix_str(
-                f"epoch {trainer.current_epoch + 1}/{trainer.max_epochs}, "
-                f"validation: {100 * values['val/exact_match']:.1f} % exact, "
+                f"val {100 * values['val/exact_match']:.1f} %, "
                 f"error {values['val/geodesic_error']:.4f}",
                 refresh=False,
             )

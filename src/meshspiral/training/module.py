@@ -103,15 +103,10 @@ class Correspondence(L.LightningModule):
     def test_step(self, batch: Batch, batch_idx: int) -> None:
         self._evaluate("test", batch)
 
-    def predict(self, *draws: Batch) -> Prediction:
-        """Predict a vertex of the template for each vertex; the loss too if there are labels.
-
-        Args:
-            *draws: Batches of one mesh with several draws of its neighbourhoods, which vote: the
-                mean of their log-probabilities decides.
-        """
-        head, embedded = self.net.head, [self.net.embed_batch(batch) for batch in draws]
-        return predict(embedded, head.weight, head.bias, draws[0].get("labels"))
+    def predict(self, batch: Batch) -> Prediction:
+        """Predict a vertex of the template for each vertex; the loss too if there are labels."""
+        head = self.net.head
+        return predict(self.net.embed_batch(batch), head.weight, head.bias, batch.get("labels"))
 
     def _evaluate(self, split: str, batch: Batch) -> None:
         found = self.predict(batch)

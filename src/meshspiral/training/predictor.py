@@ -5,13 +5,14 @@ from __future__ import annotations
 from typing import Any
 
 import torch
+from torch import Tensor
 
 from meshspiral.data.datamodule import draw
 from meshspiral.experiment.run_folder import RunError
 from meshspiral.experiment.schema import TrainConfig
 from meshspiral.neighbourhoods import Neighbourhood
 from meshspiral.neighbourhoods.base import Batch
-from meshspiral.nn.loss import Prediction
+from meshspiral.nn.loss import Prediction, predict
 from meshspiral.training.device import choose_precision, device_of
 from meshspiral.training.module import Correspondence
 
@@ -53,14 +54,41 @@ class Predictor:
             batch: An item of `MeshDataset`, with or without labels.
             purpose: Random choices of the neighbourhoods depend on it and on the run's seed.
         """
+        purposes = [(purpose,), *((purpose, "vote", k) for k in range(1, self.votes))]
+        embeddings = [self.embed(batch, *each) for each in purposes]
+        return self.predict(embeddings, batch.get("labels"))
+
+    def embed(self, batch: Batch, *purpose: int | str) -> Tensor:
+        """The input of the last layer for each vertex of a mesh, float [V, C].
+
+        Args:
+            batch: As above.
+            *purpose: As above; several parts.
+        """
         batch = self.module.transfer_batch_to_device(batch, torch.device(self.device), 0)
+        batch = draw(self.neighbourhood, batch, self.seed, "spirals", *purpose)
         if self.precision == "64-true":
             batch = {
                 key: value.double() if key in ("features", "vertices", "unit") else value
                 for key, value in batch.items()
             }
-        purposes = [(purpose,), *((purpose, "vote", k) for k in range(1, self.votes))]
-        draws = (draw(self.neighbourhood, batch, self.seed, "spirals", *p) for p in purposes)
         low = torch.autocast(self.device, torch.bfloat16, enabled=self.precision == "bf16-mixed")
         with torch.inference_mode(), low:
-            return self.module.predict(*draws)
+            return self.module.net.embed_batch(batch)
+
+    def predict(self, embedding: Tensor | list[Tensor], labels: Tensor | None = None) -> Prediction:
+        """Predict from the input of the last layer.
+
+        Args:
+            embedding: From `embed`; of several, the mean of their log-probabilities decides.
+            labels: Class indices, int64 [V], or None.
+        """
+        labels = None if labels is None else labels.to(self.device)
+        with torch.inference_mode():
+            return predict(embedding, *self.head, labels)
+
+    @property
+    def head(self) -> tuple[Tensor, Tensor]:
+        """Weight [K, C] and bias [K] of the last layer."""
+        head = self.module.net.head
+        return head.weight.detach(), head.bias.detach()

@@ -1,0 +1,134 @@
+"""How probable it is that a match is right, by the predictions of the network for both meshes.
+
+A network predicts for every vertex a distribution over the template's vertices. A match is right if
+source and target vertex belong to the same place of the template. With p the distribution of the
+source vertex, q that of the target vertex, and B[i, j] = 1 where the template vertices i and j are
+at most RADIUS apart, the probability of that is p^T B q, if the two predictions are independent.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from scipy.sparse import csr_array
+from scipy.sparse.csgraph import dijkstra
+from torch import Tensor
+
+from meshspiral.geometry.mesh import Mesh
+
+RADIUS = 0.05  # of sqrt(area), the error up to which a match counts as right
+DETOUR = 1.5  # longest way along edges, in units of RADIUS: leaves out a neighbouring finger
+PAIRS = 512  # pairs of vertices per chunk
+ROWS = 256  # rows of distances per chunk
+
+
+class Distributions(NamedTuple):
+    """The predicted distributions of a mesh, in the form in which the network has them.
+
+    Attributes:
+        embedding: float [W, C], the input of the last layer, for each vertex that was predicted.
+        weight: float [K, C], of the last layer.
+        bias: float [K].
+        row_of: int64 [V], the row of `embedding` of every given vertex; -1 for none.
+    """
+
+    embedding: Tensor
+    weight: Tensor
+    bias: Tensor
+    row_of: np.ndarray
+
+    @torch.inference_mode()
+    def rows(self, rows: np.ndarray) -> np.ndarray:
+        """Probabilities of the template's vertices, float [R, K], for some rows [R]."""
+        x = self.embedding[torch.from_numpy(rows).to(self.embedding.device)]
+        scores = torch.addmm(self.bias, x.to(self.weight.dtype), self.weight.T)
+        return torch.softmax(scores, dim=1).cpu().numpy()
+
+
+def near_vertices(template: Mesh) -> csr_array:
+    """Pairs of template vertices at most RADIUS apart.
+
+    The distance is the straight one, which on a surface differs little at this length. Vertices
+    that are further apart along edges than DETOUR are left out.
+
+    Returns:
+        float32 [K, K], 1 for each pair, also for a vertex and itself.
+    """
+    size, radius = len(template.vertices), RADIUS * np.sqrt(template.area)
+    start, tip = template.faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2).T
+    lengths = np.linalg.norm(template.vertices[start] - template.vertices[tip], axis=1)
+    keys, first = np.unique(start.astype(np.int64) * size + tip, return_index=True)
+    graph = csr_array((lengths[first], (keys // size, keys % size)), shape=(size, size))
+    found = []
+    for begin in range(0, size, ROWS):
+        block = np.arange(begin, min(begin + ROWS, size))
+        along = dijkstra(graph, directed=False, indices=block, limit=DETOUR * radius)
+        row, column = np.nonzero(np.isfinite(along))
+        offsets = template.vertices[block[row]] - template.vertices[column]
+        close = np.linalg.norm(offsets, axis=1) <= radius
+        found.append(np.stack([block[row[close]], column[close]]))
+    i, j = np.concatenate(found, axis=1)
+    return csr_array((np.ones(len(i), dtype=np.float32), (i, j)), shape=(size, size))
+
+
+def near_confidence(found: Distributions, template: np.ndarray, near: csr_array) -> np.ndarray:
+    """The predicted probability that a vertex belongs within RADIUS of its label.
+
+    Args:
+        found: Of V vertices.
+        template: int [V], their labels; -1 for none.
+        near: From `near_vertices`.
+
+    Returns:
+        float32 [V]; 0 without a label.
+    """
+    known = (template >= 0) & (found.row_of >= 0)
+    pairs = np.stack([found.row_of[known], template[known]], axis=1)
+
+    def probability(rows: np.ndarray, labels: np.ndarray) -> np.ndarray:
+        return near[labels].multiply(found.rows(rows)).sum(axis=1)
+
+    return _of_pairs(known, pairs, probability)
+
+
+def map_confidence(
+    source: Distributions, target: Distributions, match: np.ndarray, near: csr_array
+) -> np.ndarray:
+    """The predicted probability that a source vertex and its match are the same point.
+
+    The same up to RADIUS on the template, as the head of this module says.
+
+    Args:
+        source: Of V vertices.
+        target: Of the other mesh.
+        match: int [V], a target vertex for every source vertex; -1 for none.
+        near: From `near_vertices`.
+
+    Returns:
+        float32 [V]; 0 without a match.
+    """
+    known = match >= 0
+    pairs = np.stack([source.row_of[known], target.row_of[match[known]]], axis=1)
+
+    def probability(rows: np.ndarray, others: np.ndarray) -> np.ndarray:
+        distinct, of_row = np.unique(rows, return_inverse=True)  # sorted: few in a chunk
+        around = source.rows(distinct) @ near
+        others, of_other = np.unique(others, return_inverse=True)
+        return np.einsum("pk,pk->p", around[of_row], target.rows(others)[of_other])
+
+    return _of_pairs(known, pairs, probability)
+
+
+def _of_pairs(known: np.ndarray, pairs: np.ndarray, probability) -> np.ndarray:
+    """Compute each pair once, in chunks: many vertices of a dense mesh share one prediction."""
+    values = np.zeros(len(known), dtype=np.float32)
+    if known.any():
+        distinct, inverse = np.unique(pairs, axis=0, return_inverse=True)
+        chunks = [
+            probability(*distinct[begin : begin + PAIRS].T)
+            for begin in range(0, len(distinct), PAIRS)
+        ]
+        values[known] = np.clip(np.concatenate(chunks), 0, 1)[inverse.reshape(-1)]
+    return values
