@@ -312,7 +312,7 @@ class LabelledWithPoints(ShapeSet):
 
 @pytest.fixture
 def point_data(tmp_path):
-    features = Features((Shot(ShotSettings(radius=0.3, bins=4)),), 0.3)
+    features = Features((Shot(ShotSettings(radius=0.3, bins=4, by_area=False)),), 0.3)
     cache = Cache(tmp_path)
     return CorrespondenceData(LabelledWithPoints(), features, spiral(8), cache, workers=1)
 

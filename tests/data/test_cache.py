@@ -177,7 +177,7 @@ def test_two_processes_can_write_the_same_key(cache, caplog):
 
 
 def tasks():
-    shot = Shot(ShotSettings(radius=0.3, bins=4))
+    shot = Shot(ShotSettings(radius=0.3, bins=4, by_area=False))
     spheres = [bumpy_sphere(seed, subdivisions=3) for seed in range(4)]
     return [
         task

@@ -31,7 +31,8 @@ from tests.conftest import TOY_SPLIT, toy_shapes
 from tests.meshes import bumpy_sphere, lattice
 from tests.neighbourhoods.made import patch, sampled, spiral
 
-SHOT = Shot(ShotSettings(radius=0.3, bins=4))
+SHOT = Shot(ShotSettings(radius=0.3, bins=4, by_area=False))
+SHOT_CHANGES = [{}, {"radius": 0.31}, {"bins": 5}, {"by_area": True}]
 RAW = {"radius": 0.5, "rings": 2, "rays": 4, "support": 0.8}
 FEATURES = Features((SHOT,), unit=0.3)
 
@@ -204,17 +205,20 @@ def test_a_second_run_computes_nothing(cache, monkeypatch):
 
 def test_cache_keys_depend_on_every_parameter():
     mesh = bumpy_sphere()
-    settings = [{"radius": 0.3, "bins": 4}, {"radius": 0.31, "bins": 4}, {"radius": 0.3, "bins": 5}]
+    settings = [SHOT.settings.model_dump() | change for change in SHOT_CHANGES]
     descriptors = [Shot(ShotSettings(**each)) for each in settings]
     descriptors += [Raw(Raw.Settings(**{**RAW, key: RAW[key] + 1})) for key in RAW]
-    assert len({descriptor_task(mesh, each).key for each in descriptors}) == 3 + len(RAW)
+    assert len({descriptor_task(mesh, each).key for each in descriptors}) == len(
+        SHOT_CHANGES
+    ) + len(RAW)
     neighbourhoods = [spiral(8), spiral(9), spiral(8, rings=1), spiral(8, rings=2)]
     neighbourhoods += [patch(), patch(radius=0.11), patch(rings=4), patch(rays=16)]
     neighbourhoods += [patch(weights="gaussian"), spiral(8, dilation=2), spiral(8, start="frame")]
     changes = [{}, {"rings": 4}, {"rays": 6}, {"radius": 0.5}, {"radius": [0.5, 0.5, 1.0]}]
     changes += [{"blend": True}, {"relative_to": "diameter"}, {"start": "random"}, {"support": 0.5}]
+    changes += [{"by_area": True}]
     neighbourhoods += [sampled(**change) for change in changes]
-    assert len({neighbourhood_task(mesh, each).key for each in neighbourhoods}) == 20
+    assert len({neighbourhood_task(mesh, each).key for each in neighbourhoods}) == 21
 
 
 def test_cache_keys_depend_on_content_and_code_but_not_on_the_name(monkeypatch):
@@ -317,8 +321,8 @@ def test_a_split_without_meshes_is_rejected(cache):
 
 def test_a_mesh_far_from_the_origin_has_the_same_descriptors(cache):
     mesh = bumpy_sphere()
-    near = preprocessing._descriptors(mesh, 0.3, 4)["features"]
-    far = preprocessing._descriptors(Mesh(mesh.vertices + 1e4, mesh.faces), 0.3, 4)["features"]
+    near = SHOT.compute(mesh)
+    far = SHOT.compute(Mesh(mesh.vertices + 1e4, mesh.faces))
     assert (np.abs(far - near).max(axis=1) < 1e-3).mean() > 0.98
 
 

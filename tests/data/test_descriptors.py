@@ -7,10 +7,13 @@ import pytest
 
 from meshspiral.data.descriptors import Descriptor, Features
 from meshspiral.data.descriptors.raw import Raw
+from meshspiral.data.descriptors.shot import Shot
 from meshspiral.data.descriptors.xyz import Xyz
 from meshspiral.data.preprocessing import compute_task, descriptor_task
+from meshspiral.data.settings import ShotSettings
 from meshspiral.experiment.schema import ConfigError
 from meshspiral.geometry.mesh import Mesh
+from tests.geometry.test_sampling import split_faces
 from tests.helpers import composed
 from tests.meshes import bumpy_sphere, lattice, union
 
@@ -98,3 +101,14 @@ def test_descriptors_stand_side_by_side():
 def test_wrong_features_are_one_line(override, message):
     with pytest.raises(ConfigError, match=message.replace("[", "\\[")):
         composed([override])
+
+
+def test_shot_by_area_changes_less_where_vertices_are_added():
+    mesh = bumpy_sphere(4, 4)
+    dense = split_faces(mesh, np.flatnonzero(mesh.vertices[mesh.faces].mean(1)[:, 0] > 0.2))
+    distances = []
+    for by_area in (False, True):
+        shot = Shot(ShotSettings(radius=0.3, bins=6, by_area=by_area))
+        ours, theirs = described(mesh, shot), described(dense, shot)[: len(mesh.vertices)]
+        distances.append(np.median(np.linalg.norm(ours - theirs, axis=1)))
+    assert distances[1] < 0.7 * distances[0]

@@ -177,3 +177,29 @@ def test_the_start_turns_with_the_mesh():
     ]
     apart = np.abs((starts[0] - starts[1] + np.pi) % (2 * np.pi) - np.pi)
     assert (apart < 1e-3).mean() > 0.99  # rounding flips an axis where its sides tie
+
+
+def test_frames_by_area_hold_where_vertices_are_added():
+    """Splitting faces of one side changes the count of vertices, not the surface."""
+    mesh = bumpy_sphere(4, 3)
+    dense = split_faces(mesh, np.flatnonzero(mesh.vertices[mesh.faces].mean(1)[:, 0] > 0.2))
+    count = len(mesh.vertices)
+
+    def agreement(by_area):
+        axes = [
+            local_frames(m.vertices, 1.2, m.vertex_areas if by_area else None)[:count, 0]
+            for m in (mesh, dense)
+        ]
+        return ((axes[0] * axes[1]).sum(axis=1) > np.cos(np.pi / 8)).mean()
+
+    assert agreement(by_area=True) > 0.9 > agreement(by_area=False) + 0.1
+
+
+def split_faces(mesh: Mesh, chosen: np.ndarray) -> Mesh:
+    """The mesh with a new vertex in the middle of each chosen face."""
+    a, b, c = mesh.faces[chosen].T
+    new = len(mesh.vertices) + np.arange(len(chosen))
+    middles = mesh.vertices[mesh.faces[chosen]].mean(axis=1)
+    kept = np.delete(mesh.faces, chosen, axis=0)
+    parts = [np.stack(part, axis=1) for part in ((a, b, new), (b, c, new), (c, a, new))]
+    return Mesh(np.concatenate([mesh.vertices, middles]), np.concatenate([kept, *parts]))

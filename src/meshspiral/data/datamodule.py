@@ -87,10 +87,9 @@ def neighbourhood_tensors(
         arrays: The result of its `neighbourhood_task`.
         cache: Where local frames are read from, or computed into; None for no cache.
     """
-    support = neighbourhood.frame_support
-    if support is None:
+    if neighbourhood.frame is None:
         return neighbourhood.tensors(arrays, mesh)
-    task = frame_task(mesh, support)
+    task = frame_task(mesh, neighbourhood.frame)
     frames = compute_task(task) if cache is None else load_task(task, cache)
     return neighbourhood.tensors(arrays, mesh, frames["frames"])
 

@@ -23,6 +23,7 @@ from meshspiral.geometry import mesh as meshes
 from meshspiral.geometry import shot
 from meshspiral.geometry.digest import digest
 from meshspiral.geometry.mesh import Mesh, MeshError
+from meshspiral.geometry.shot import Frame
 from meshspiral.neighbourhoods import Neighbourhood
 
 POOL_START = 6.0  # seconds that starting the worker processes takes
@@ -41,15 +42,11 @@ class Task:
     arguments: tuple
 
 
-def frame_task(mesh: Mesh, support: float) -> Task:
-    """The local frames of a mesh: `frames` float32 [V, 3, 3], see `local_frames`.
-
-    Args:
-        mesh: The surface.
-        support: Radius of their support over the square root of the surface area.
-    """
+def frame_task(mesh: Mesh, frame: Frame) -> Task:
+    """The local frames of a mesh: `frames` float32 [V, 3, 3], see `local_frames`."""
     version = code_version(meshes, shot, sys.modules[__name__])
-    return Task("frames", digest(mesh.vertices, support, version), _frames, (mesh, support))
+    key = digest(mesh.vertices, mesh.faces, *frame, version)
+    return Task("frames", key, _frames, (mesh, frame))
 
 
 def descriptor_task(mesh: Mesh, descriptor: Descriptor) -> Task:
@@ -75,19 +72,23 @@ def neighbourhood_task(mesh: Mesh, neighbourhood: Neighbourhood) -> Task:
 
 def _sources(described: Descriptor | Neighbourhood) -> list[ModuleType]:
     """The modules of an object's class and of those that it derives from, without the base."""
-    classes = [cls for cls in type(described).__mro__ if hasattr(cls, "frame_support")]
+    classes = [
+        cls for cls in type(described).__mro__ if issubclass(cls, Descriptor | Neighbourhood)
+    ]
     return [inspect.getmodule(cls) for cls in classes[:-1]]
 
 
 def _inputs(described: Descriptor | Neighbourhood, mesh: Mesh) -> tuple:
     """What its `compute` takes: the mesh, and frames if it needs them."""
-    support = described.frame_support
-    return (mesh,) if support is None else (mesh, frame_task(mesh, support))
+    frame = described.frame
+    return (mesh,) if frame is None else (mesh, frame_task(mesh, frame))
 
 
-def _frames(mesh: Mesh, support: float) -> Arrays:
+def _frames(mesh: Mesh, frame: Frame) -> Arrays:
     _check_area(mesh)
-    return {"frames": shot.local_frames(mesh.centred, support * np.sqrt(mesh.area))}
+    masses = mesh.vertex_areas if frame.by_area else None
+    radius = frame.support * np.sqrt(mesh.area)
+    return {"frames": shot.local_frames(mesh.centred, radius, masses)}
 
 
 def _described(descriptor: Descriptor, mesh: Mesh, *frames: np.ndarray) -> Arrays:

@@ -80,9 +80,7 @@ class ReferenceDistances:
             Vertices, int64 [K, M], and their probabilities, float32 [K, M]. M is the largest number
             of vertices within three widths; a row with fewer ends with probabilities of 0.
         """
-        count, faces = len(self.template.vertices), self.template.faces
-        face_areas = np.linalg.norm(self.template.face_normals, axis=1)
-        areas = np.bincount(faces.ravel(), np.repeat(face_areas, 3), minlength=count)
+        count, areas = len(self.template.vertices), self.template.vertex_areas
         rows = []
         blocks = range(-(-count // BLOCK))
         for block in tqdm(blocks, desc="Soft labels", unit="block", leave=False, delay=1.0):

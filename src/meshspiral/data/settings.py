@@ -31,6 +31,10 @@ class ShotSettings(Strict):
         gt=0, description="radius of SHOT's support over the square root of the surface area"
     )
     bins: int = Field(ge=1, description="bins of the cosine; 16 give 544 channels")
+    by_area: bool = Field(
+        description="weigh vertices by their areas instead of equally, as SHOT does; depends less "
+        "on the tessellation"
+    )
 
 
 class RemeshSettings(Strict):

@@ -314,6 +314,10 @@ def read_stored_config(values: dict[str, Any], source: str = "the config") -> Tr
     return _read(TrainConfig, values)
 
 
+# settings of a spiral that were added after version 0.2, with the values of its time
+STARTED = {"dilation": 1, "start": "random", "support": 0.3, "by_area": True, "jitter": 0}
+
+
 def upgraded(values: dict[str, Any]) -> dict[str, Any]:
     """A stored config of this or an earlier version in today's layout.
 
@@ -336,9 +340,11 @@ def upgraded(values: dict[str, Any]) -> dict[str, Any]:
         data["remesh"].setdefault("copies", 1)
     data.setdefault("remesh", None)
     data.setdefault("features", ["shot"])
+    if isinstance(data.get("shot"), dict):
+        data["shot"].setdefault("by_area", False)
     data.setdefault("raw", {"radius": 0.16, "rings": 3, "rays": 8, "support": 0.3})
     if values["neighbourhood"].get("name") == "spiral":
-        for key, value in {"dilation": 1, "start": "random", "support": 0.3, "jitter": 0}.items():
+        for key, value in STARTED.items():
             values["neighbourhood"].setdefault(key, value)
     data.setdefault("shuffle_vertices", False)
     if isinstance(values.get("optim"), dict):

@@ -15,6 +15,7 @@ on their signs tie. Rounding alone therefore changes some rows, less than 1 %, o
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit
@@ -32,6 +33,7 @@ def shot_descriptors(
     radius: float,
     bins: int = 16,
     pcl_cosine_wrap: bool = False,
+    masses: np.ndarray | None = None,
 ) -> np.ndarray:
     """The SHOT descriptor of every vertex (Salti, Tombari, Di Stefano 2014).
 
@@ -55,6 +57,9 @@ def shot_descriptors(
             dimensions, 10 gives 352.
         pcl_cosine_wrap: Repeat an error of PCL, to compare with its values: cosine votes of bin
             `bins - 1` towards bin `bins` go to bin 0. The authors' own code has corrected it.
+        masses: float [V], the weight of each vertex in frames and histograms, for instance its
+            area; None for 1, as in SHOT. With areas, the descriptor depends less on the density of
+            the vertices.
 
     Returns:
         float32 [V, 32 * (bins + 1)], rows of unit L2 norm. A row is NaN where the descriptor is
@@ -73,7 +78,19 @@ def shot_descriptors(
         )
     if not isinstance(bins, (int, np.integer)) or bins < 1:
         raise ValueError(f"bins must be an integer of at least 1, got {bins}")
-    return _descriptors_and_frames(vertices, normals, radius, bins, pcl_cosine_wrap)[0]
+    return _descriptors_and_frames(vertices, normals, radius, bins, pcl_cosine_wrap, masses)[0]
+
+
+class Frame(NamedTuple):
+    """What defines the local frames of a mesh.
+
+    Attributes:
+        support: Radius of the support over the square root of the surface area.
+        by_area: Whether vertices weigh by their areas instead of equally.
+    """
+
+    support: float
+    by_area: bool
 
 
 def check_support(vertices: np.ndarray, radius: float) -> None:
@@ -93,16 +110,19 @@ def check_support(vertices: np.ndarray, radius: float) -> None:
         )
 
 
-def local_frames(vertices: np.ndarray, radius: float) -> np.ndarray:
+def local_frames(
+    vertices: np.ndarray, radius: float, masses: np.ndarray | None = None
+) -> np.ndarray:
     """The local frame of every vertex (Salti, Tombari, Di Stefano 2014, section 3).
 
-    The axes are those of the covariance of the vertices nearer than the radius, weighted by radius
-    - distance. The x axis has the largest variance and points to the side with most of them; so
-    does the z axis, which has the smallest; y is z x x.
+    The axes are those of the covariance of the vertices nearer than the radius, weighted by
+    (radius - distance) times their mass. The x axis has the largest variance and points to the side
+    with most mass; so does the z axis, which has the smallest; y is z x x.
 
     Args:
         vertices: float [V, 3]; as for `shot_descriptors`.
         radius: Of the support, in the unit of the vertices.
+        masses: float [V], as for `shot_descriptors`.
 
     Returns:
         float32 [V, 3, 3], rows x, y, z; NaN where fewer than five vertices are in the support.
@@ -115,11 +135,12 @@ def local_frames(vertices: np.ndarray, radius: float) -> np.ndarray:
     sorted_points = _sorted_by_cell(vertices, radius)
     if sorted_points is not None:
         points, cells, ranges, order = sorted_points
-        _frames_kernel(points, cells, ranges, order, float(radius), frames)
+        masses = _sorted_masses(masses, order)
+        _frames_kernel(points, masses, cells, ranges, order, float(radius), frames)
     return frames
 
 
-def _descriptors_and_frames(vertices, normals, radius, bins, pcl_cosine_wrap):
+def _descriptors_and_frames(vertices, normals, radius, bins, pcl_cosine_wrap, masses=None):
     """The descriptors of `shot_descriptors`, and the local frames.
 
     Returns:
@@ -136,6 +157,7 @@ def _descriptors_and_frames(vertices, normals, radius, bins, pcl_cosine_wrap):
         _kernel(
             points,
             np.ascontiguousarray(directions[order].T),
+            _sorted_masses(masses, order),
             cells,
             ranges,
             order,
@@ -165,6 +187,11 @@ def _sorted_by_cell(vertices: np.ndarray, radius: float) -> tuple[np.ndarray, ..
     cells, ranges = _candidate_ranges(keys[order])
     order = usable[order]
     return np.ascontiguousarray(points[order].T), cells, ranges, order
+
+
+def _sorted_masses(masses: np.ndarray | None, order: np.ndarray) -> np.ndarray:
+    """The masses of the sorted points, float64 [N]; 1 for None."""
+    return np.ones(len(order)) if masses is None else np.asarray(masses, np.float64)[order]
 
 
 def _cell_keys(points: np.ndarray, radius: float) -> np.ndarray:
@@ -203,11 +230,12 @@ def _candidate_ranges(keys: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 @njit(cache=True, error_model="numpy")
-def _kernel(points, normals, cells, ranges, order, radius, bins, wrap, rows, frames):
+def _kernel(points, normals, masses, cells, ranges, order, radius, bins, wrap, rows, frames):
     """Compute the descriptors and local frames of all usable points.
 
     Args:
         points, normals: float32 [3, N], sorted by cell.
+        masses: float64 [N].
         cells, ranges: As `_candidate_ranges` returns them.
         order: int64 [N], the vertex of every point.
         radius, bins, wrap: As in `shot_descriptors`.
@@ -217,17 +245,17 @@ def _kernel(points, normals, cells, ranges, order, radius, bins, wrap, rows, fra
     n = points.shape[1]
     index, square = np.empty(n + 1, np.int64), np.empty(n + 1, np.float32)
     distance = np.empty(n, np.float64)
-    offset = np.empty((3, n), np.float32)
+    offset, mass = np.empty((3, n), np.float32), np.empty(n, np.float64)
     histogram = np.empty(SECTORS * (bins + 1), np.float64)
     limit = np.float32(radius * radius)
     for i in range(n):
         m = _neighbours(points, i, ranges[cells[i]], limit, index, square)
         if m < LEAST_NEIGHBOURS:
             continue
-        _offsets(points, i, index, square, m, offset, distance)
+        _offsets(points, masses, i, index, square, m, offset, distance, mass)
         frame = frames[order[i]]
-        _local_frame(offset, distance, square, m, radius, frame)
-        _vote(offset, distance, normals, index, m, frame, radius, bins, wrap, histogram)
+        _local_frame(offset, distance, square, mass, m, radius, frame)
+        _vote(offset, distance, mass, normals, index, m, frame, radius, bins, wrap, histogram)
         total = 0.0
         for c in range(len(histogram)):
             total += histogram[c] * histogram[c]
@@ -238,25 +266,26 @@ def _kernel(points, normals, cells, ranges, order, radius, bins, wrap, rows, fra
 
 
 @njit(cache=True, error_model="numpy")
-def _frames_kernel(points, cells, ranges, order, radius, frames):
+def _frames_kernel(points, masses, cells, ranges, order, radius, frames):
     """Write the local frames of all usable points; arguments as for `_kernel`."""
     n = points.shape[1]
     index, square = np.empty(n + 1, np.int64), np.empty(n + 1, np.float32)
     distance = np.empty(n, np.float64)
-    offset = np.empty((3, n), np.float32)
+    offset, mass = np.empty((3, n), np.float32), np.empty(n, np.float64)
     limit = np.float32(radius * radius)
     for i in range(n):
         m = _neighbours(points, i, ranges[cells[i]], limit, index, square)
         if m < LEAST_NEIGHBOURS:
             continue
-        _offsets(points, i, index, square, m, offset, distance)
-        _local_frame(offset, distance, square, m, radius, frames[order[i]])
+        _offsets(points, masses, i, index, square, m, offset, distance, mass)
+        _local_frame(offset, distance, square, mass, m, radius, frames[order[i]])
 
 
 @njit(cache=True, error_model="numpy")
-def _offsets(points, i, index, square, m, offset, distance):
-    """Write the offsets, float32 [3, N], and distances, float64 [N], of the m neighbours."""
+def _offsets(points, masses, i, index, square, m, offset, distance, mass):
+    """Write offsets, float32 [3, N], distances and masses, float64 [N], of the m neighbours."""
     for k in range(m):
+        mass[k] = masses[index[k]]
         # in float32, like PCL: where axes are nearly tied, more digits rotate them by 1e-5
         distance[k] = np.sqrt(square[k])
         for axis in range(3):
@@ -292,7 +321,7 @@ def _neighbours(points, i, ranges, limit, index, square):
 
 
 @njit(cache=True, error_model="numpy")
-def _local_frame(offset, distance, square, m, radius, frame):
+def _local_frame(offset, distance, square, mass, m, radius, frame):
     """Write the local frame: the axes of the neighbours' weighted covariance.
 
     x is the eigenvector of the largest eigenvalue, z that of the smallest, and y their cross
@@ -302,14 +331,15 @@ def _local_frame(offset, distance, square, m, radius, frame):
         offset: float32 [3, N], the neighbours relative to the centre.
         distance: float64 [N], their distances.
         square: float32 [N], their squared distances.
+        mass: float64 [N], their masses.
         m: Number of neighbours.
-        radius: Neighbours weigh radius - distance.
+        radius: Neighbours weigh (radius - distance) times their mass.
         frame: float32 [3, 3], receives the axes as rows.
     """
     xx = xy = xz = yy = yz = zz = total = 0.0
     for k in range(m):
         x, y, z = np.float64(offset[0, k]), np.float64(offset[1, k]), np.float64(offset[2, k])
-        w = radius - distance[k]
+        w = (radius - distance[k]) * mass[k]
         total += w
         xx += w * x * x
         xy += w * x * y
@@ -327,7 +357,7 @@ def _local_frame(offset, distance, square, m, radius, frame):
         smallest = c if matrix[c, c] <= matrix[smallest, smallest] else smallest
     for row, column in ((0, largest), (2, smallest)):
         a, b, c = vectors[0, column], vectors[1, column], vectors[2, column]
-        sign = 1.0 if _points_along(offset, square, m, a, b, c) else -1.0
+        sign = 1.0 if _points_along(offset, square, mass, m, a, b, c) else -1.0
         frame[row, 0], frame[row, 1], frame[row, 2] = sign * a, sign * b, sign * c
     x, z = frame[0], frame[2]
     frame[1, 0] = z[1] * x[2] - z[2] * x[1]
@@ -367,16 +397,17 @@ def _eigenvectors(a):
 
 
 @njit(cache=True, error_model="numpy")
-def _points_along(offset, square, m, a, b, c):
-    """Whether most of the m neighbours lie on the side that the axis (a, b, c) points to.
+def _points_along(offset, square, mass, m, a, b, c):
+    """Whether most mass of the m neighbours lies on the side that the axis (a, b, c) points to.
 
     A tie is decided by the majority of the five neighbours around the median distance.
     """
-    count = 0
+    side, total = 0.0, 0.0
     for k in range(m):
-        count += a * offset[0, k] + b * offset[1, k] + c * offset[2, k] >= 0
-    if 2 * count != m:
-        return 2 * count > m
+        total += mass[k]
+        side += mass[k] * (a * offset[0, k] + b * offset[1, k] + c * offset[2, k] >= 0)
+    if 2 * side != total:
+        return 2 * side > total
     count = 0
     nearest = np.argsort(square[:m], kind="mergesort")  # stable: equal distances stay in order
     for k in nearest[m // 2 - 2 : m // 2 + 3]:
@@ -385,7 +416,7 @@ def _points_along(offset, square, m, a, b, c):
 
 
 @njit(cache=True, error_model="numpy")
-def _vote(offset, distance, normals, index, m, frame, radius, bins, wrap, histogram):
+def _vote(offset, distance, mass, normals, index, m, frame, radius, bins, wrap, histogram):
     """Fill the histogram from the m neighbours, before normalisation.
 
     A neighbour falls into one cell. In each of four coordinates (cosine, radius, elevation,
@@ -393,7 +424,7 @@ def _vote(offset, distance, normals, index, m, frame, radius, bins, wrap, histog
     cell on that side gets |e|, if there is one.
 
     Args:
-        offset, distance, m, radius: As in `_local_frame`.
+        offset, distance, mass, m, radius: As in `_local_frame`.
         normals: float32 [3, N].
         index: int64 [N+1], the neighbours.
         frame: float32 [3, 3], the local frame.
@@ -422,20 +453,20 @@ def _vote(offset, distance, normals, index, m, frame, radius, bins, wrap, histog
         e = position - bin_
         weight = 1 - abs(e)
         if e > 0:
-            histogram[cell - bin_ if wrap and bin_ == bins - 1 else cell + 1] += e
+            histogram[cell - bin_ if wrap and bin_ == bins - 1 else cell + 1] += mass[k] * e
         elif e < 0:
-            histogram[cell - 1] -= e
+            histogram[cell - 1] -= mass[k] * e
 
         e = 2 * d / radius - (1.5 if outer else 0.5)
         weight += 1 - abs(e)
-        histogram[(sector ^ 2) * (bins + 1) + bin_] += max(-e if outer else e, 0.0)
+        histogram[(sector ^ 2) * (bins + 1) + bin_] += mass[k] * max(-e if outer else e, 0.0)
 
         e = arccos(min(max(z / d, -1.0), 1.0)) * (2 / math.pi) - (0.5 if upper else 1.5)
         weight += 1 - abs(e)
-        histogram[(sector ^ 1) * (bins + 1) + bin_] += max(e if upper else -e, 0.0)
+        histogram[(sector ^ 1) * (bins + 1) + bin_] += mass[k] * max(e if upper else -e, 0.0)
 
         if x != 0 or y != 0:
             weight += 1 - abs(azimuth_offset)
             beside = (sector + (4 if azimuth_offset > 0 else -4)) % SECTORS
-            histogram[beside * (bins + 1) + bin_] += abs(azimuth_offset)
-        histogram[cell] += weight
+            histogram[beside * (bins + 1) + bin_] += mass[k] * abs(azimuth_offset)
+        histogram[cell] += mass[k] * weight

@@ -11,6 +11,7 @@ import torch
 from pydantic import BaseModel
 
 from meshspiral.geometry.mesh import Mesh
+from meshspiral.geometry.shot import Frame
 
 Arrays = dict[str, np.ndarray]
 Batch = dict[str, Any]
@@ -87,11 +88,11 @@ class Neighbourhood(ABC):
         return False
 
     @property
-    def frame_support(self) -> float | None:
-        """Radius of local frames over the square root of the surface area; None for no frames.
+    def frame(self) -> Frame | None:
+        """The local frames that it needs; None for none.
 
-        If it is a number, `compute` and `tensors` get the frames of `local_frames` as a further
-        argument, float32 [V, 3, 3].
+        If it is not None, `compute` and `tensors` get the frames as a further argument,
+        float32 [V, 3, 3], see `local_frames`.
         """
         return None
 

@@ -11,6 +11,7 @@ from scipy.sparse import csr_array
 
 from meshspiral.geometry import connectivity, geodesics, patches, sampling, shot
 from meshspiral.geometry.mesh import Mesh
+from meshspiral.geometry.shot import Frame
 from meshspiral.neighbourhoods.base import Arrays, Batch, Neighbourhood
 from meshspiral.neighbourhoods.patch import by_rows_and_columns, first_directions
 from meshspiral.neighbourhoods.starts import StartSettings, draw_starts, start_title
@@ -78,8 +79,8 @@ class Sampled(Neighbourhood, name="sampled"):
         return self.settings.start == "random"
 
     @property
-    def frame_support(self) -> float | None:
-        return None if self.random else self.settings.support
+    def frame(self) -> Frame | None:
+        return None if self.random else self.settings.frame
 
     @property
     def _radii(self) -> list[float]:

@@ -11,6 +11,7 @@ from pydantic import Field, field_validator
 from meshspiral.geometry import connectivity, spirals
 from meshspiral.geometry.mesh import Mesh
 from meshspiral.geometry.sampling import nearest_neighbours
+from meshspiral.geometry.shot import Frame
 from meshspiral.neighbourhoods.base import Arrays, Batch, Neighbourhood
 from meshspiral.neighbourhoods.starts import StartSettings, draw_starts, start_title
 
@@ -67,8 +68,8 @@ class Spiral(Neighbourhood, name="spiral"):
         return self.settings.start == "random"
 
     @property
-    def frame_support(self) -> float | None:
-        return None if self.random else self.settings.support
+    def frame(self) -> Frame | None:
+        return None if self.random else self.settings.frame
 
     @property
     def _steps(self) -> list[int]:

@@ -7,6 +7,7 @@ from typing import Literal, Self
 import torch
 from pydantic import Field, model_validator
 
+from meshspiral.geometry.shot import Frame
 from meshspiral.neighbourhoods.base import Neighbourhood
 
 
@@ -20,9 +21,18 @@ class StartSettings(Neighbourhood.Settings):
     support: float = Field(
         gt=0, description="radius of that frame over the square root of the surface area"
     )
+    by_area: bool = Field(
+        description="the frame weighs vertices by their areas instead of equally, as SHOT does; it "
+        "then depends less on the tessellation"
+    )
     jitter: int = Field(
         ge=0, description="start=frame: up to so many steps beside it in training, at random"
     )
+
+    @property
+    def frame(self) -> Frame:
+        """The frame that gives the start."""
+        return Frame(self.support, self.by_area)
 
     @model_validator(mode="after")
     def _jitter_of_frame(self) -> Self:

@@ -13,6 +13,7 @@ from pydantic import BaseModel, create_model
 
 from meshspiral.data.settings import DataSettings
 from meshspiral.geometry.mesh import Mesh
+from meshspiral.geometry.shot import Frame
 
 
 class Descriptor(ABC):
@@ -50,8 +51,8 @@ class Descriptor(ABC):
         """Number of channels."""
 
     @property
-    def frame_support(self) -> float | None:
-        """Radius of the local frames that `compute` needs, over the square root of the area."""
+    def frame(self) -> Frame | None:
+        """The local frames that `compute` needs; None for none."""
         return None
 
     @abstractmethod
@@ -60,7 +61,7 @@ class Descriptor(ABC):
 
         Args:
             mesh: The surface, of an area above 0.
-            frames: If `frame_support` is a number, the frames of `local_frames`, float32 [V, 3, 3].
+            frames: If `frame` is not None, the frames of `local_frames`, float32 [V, 3, 3].
 
         Returns:
             float32 [V, channels], with NaN in rows where the descriptor is undefined.

@@ -9,6 +9,7 @@ from meshspiral.data.descriptors.base import Descriptor
 from meshspiral.data.settings import Strict
 from meshspiral.geometry import barycentric, connectivity, patches, sampling, shot
 from meshspiral.geometry.mesh import Mesh
+from meshspiral.geometry.shot import Frame
 
 
 class Raw(Descriptor, name="raw"):
@@ -40,8 +41,8 @@ class Raw(Descriptor, name="raw"):
         return 8 * self.settings.rings * self.settings.rays + 3
 
     @property
-    def frame_support(self) -> float:
-        return self.settings.support
+    def frame(self) -> Frame:
+        return Frame(self.settings.support, by_area=True)
 
     def compute(self, mesh: Mesh, frames: np.ndarray | None = None) -> np.ndarray:
         rings, rays = self.settings.rings, self.settings.rays
