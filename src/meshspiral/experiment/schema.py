@@ -94,7 +94,10 @@ class TrainConfig(Settings):
         description="true: every element of a spiral also carries its distance and angle"
     )
     seed: int = Field(ge=0, lt=2**32, description="seed of weights, order, spirals and dropout")
-    resume: Text | None = Field(description="folder of a stopped run to resume")
+    init: Text | None = Field(
+        description="start from the weights of a run folder or checkpoint, or of bundled"
+    )
+    resume: Text | None = Field(description="folder of a run to resume or to train longer")
     plugins: Plugins
     model: SerializeAsAny[BaseModel]
     neighbourhood: SerializeAsAny[BaseModel]
@@ -307,6 +310,7 @@ def upgraded(values: dict[str, Any]) -> dict[str, Any]:
     data.setdefault("shuffle_vertices", False)
     values.setdefault("plugins", [])
     values.setdefault("picture", True)
+    values.setdefault("init", None)
     return values
 
 

@@ -16,7 +16,8 @@ from meshspiral.experiment.run_folder import BEST
 from meshspiral.experiment.schema import MatchConfig, read_config
 from meshspiral.geometry.digest import digest
 from meshspiral.geometry.mesh import MeshError
-from meshspiral.matching.matcher import BUNDLED_RUN, Labels, Matcher, nearest_vertices
+from meshspiral.matching.matcher import Labels, Matcher, nearest_vertices
+from meshspiral.training.checkpoints import BUNDLED_RUN
 
 
 class LabelledScan(NamedTuple):

@@ -24,10 +24,9 @@ from meshspiral.geometry.barycentric import interpolate
 from meshspiral.geometry.mesh import Mesh
 from meshspiral.geometry.resample import resample
 from meshspiral.geometry.zoomout import TO, eigenfunctions, zoomout
-from meshspiral.training.checkpoints import config_of, read_checkpoint, template_of
+from meshspiral.training.checkpoints import BUNDLED_RUN, config_of, read_checkpoint, template_of
 from meshspiral.training.predictor import Predictor
 
-BUNDLED_RUN = Path(__file__).parents[1] / "data" / "assets" / "bodies_run"
 NEAR = 5.0  # mean edges of the template; labels further apart are not interpolated
 
 
