@@ -20,6 +20,7 @@ from meshspiral.experiment.schema import TrainConfig, flat
 from meshspiral.neighbourhoods import Neighbourhood
 from meshspiral.training.callbacks import Speed
 from meshspiral.training.initial import InitialWeights
+from meshspiral.training.memory import estimate_memory, free_bytes_on, memory_lines
 from meshspiral.training.module import Correspondence
 from meshspiral.training.resume import Progress, check_checkpoint, store_changes
 from meshspiral.training.trainer import build_trainer
@@ -55,6 +56,11 @@ def train(config: TrainConfig, folder: Path) -> dict[str, float]:
         log.info(line)
     for line in initial.load_into(module, data.shapes.template) if initial else ():
         log.info(line)
+
+    estimate = estimate_memory(module.net, data, trainer.precision)
+    device = trainer.strategy.root_device
+    for level, line in memory_lines(estimate, free_bytes_on(device), device.type):
+        log.log(level, line)
 
     progress = None
     if last:
