@@ -18,6 +18,7 @@ from typing import Any
 import torch
 
 from meshspiral.training.device import choose_precision
+from meshspiral.training.memory import bytes_in
 
 Action = Callable[[], object]
 Row = dict[str, Any]  # a row of a table: columns by name
@@ -93,23 +94,9 @@ def peak_bytes(action: Action) -> int | None:
     with contextlib.suppress(OSError, AttributeError):  # a C library other than GNU's
         ctypes.CDLL("libc.so.6").malloc_trim(0)
     Path("/proc/self/clear_refs").write_text("5")  # reset the peak, VmHWM
-    before = _bytes_in(status, "VmRSS")
+    before = bytes_in(status, "VmRSS")
     action()
-    return _bytes_in(status, "VmHWM") - before
-
-
-def free_bytes() -> int | None:
-    """Memory that new processes can use; None on systems other than Linux."""
-    meminfo = Path("/proc/meminfo")
-    return _bytes_in(meminfo, "MemAvailable") if meminfo.exists() else None
-
-
-def _bytes_in(file: Path, key: str) -> int:
-    """An entry of a file of /proc, which holds lines such as `VmRSS: 1234 kB`."""
-    for line in file.read_text().splitlines():
-        if line.startswith(f"{key}:"):
-            return 1024 * int(line.split()[1])
-    raise KeyError(key)
+    return bytes_in(status, "VmHWM") - before
 
 
 def machine() -> dict[str, Any]:

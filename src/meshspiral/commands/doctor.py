@@ -52,9 +52,9 @@ def hardware() -> list[tuple[str, str]]:
     """Processor, GPUs, precision, OpenGL and memory."""
     import torch
 
-    from meshspiral.benchmarking.measure import free_bytes
     from meshspiral.geometry.mesh import Mesh
     from meshspiral.training.device import choose_precision
+    from meshspiral.training.memory import free_bytes
     from meshspiral.viz.render import RenderError, Row, render
 
     triangle = Mesh(np.eye(3), [[0, 1, 2]])

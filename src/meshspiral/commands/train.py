@@ -12,7 +12,7 @@ from pathlib import Path
 
 from meshspiral.experiment.entry import entry_point
 from meshspiral.experiment.program import command_line, module_of
-from meshspiral.experiment.run_folder import METRICS, RunError, Stopped
+from meshspiral.experiment.run_folder import METRICS, RunError, Stopped, read_run_config
 from meshspiral.experiment.runs import (
     InUse,
     alone,
@@ -48,13 +48,13 @@ def main(config: TrainConfig) -> None:
     separate = in_sweep and config.trainer.strategy != "auto"
     try:
         with alone(folder) if is_first() else contextlib.nullcontext():
-            if in_sweep and (folder / METRICS).is_file():
+            if in_sweep and is_finished(folder, config):
                 log.info("already finished: %s", folder)
                 return
             if not separate:
                 train(config, folder)
         if separate:
-            train_separately(folder, [word for word in overrides if may_change(word)])
+            train_separately(folder, [word for word in overrides if may_change(word, resumed=True)])
     except InUse:
         if not in_sweep:
             raise
@@ -65,6 +65,12 @@ def main(config: TrainConfig) -> None:
         resume = f"{command_line('train')} {shlex.quote(f'resume={folder}')}"
         message = "Stopped." if in_sweep else f"Stopped. To resume: {resume}"
         raise Stopped(stopped.signum, message) from None
+
+
+def is_finished(folder: Path, config: TrainConfig) -> bool:
+    """Whether a run has metrics, and is not to have other epochs now."""
+    epochs = config.optim.epochs
+    return (folder / METRICS).is_file() and read_run_config(folder).optim.epochs == epochs
 
 
 def train_separately(folder: Path, overrides: list[str]) -> None:

@@ -110,7 +110,7 @@ def usual_size(vertices: int) -> int:
         The number, rounded to hundreds above 1000, and at least 12.
     """
     size = vertices * 5000 / 6890
-    return int(round(size, -2)) if size > 1000 else max(12, round(size))
+    return round(size / 100) * 100 if size > 1000 else max(12, round(size))
 
 
 def _remesh(source: Mesh, vertices: int, policy: str, seed: int) -> Arrays:

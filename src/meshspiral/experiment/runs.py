@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import logging
 import os
 from collections.abc import Iterator
 from pathlib import Path
@@ -11,11 +12,16 @@ from typing import Any
 from filelock import FileLock, Timeout
 from omegaconf import DictConfig, OmegaConf
 
-from meshspiral.experiment.run_folder import CONFIG, RunError, read_run_config, write_config
+from meshspiral.experiment.run_folder import CONFIG, LAST, RunError, read_run_config, write_config
 from meshspiral.experiment.schema import TrainConfig, flat, read_config
 
 # how and where a run is computed, which may change when it is resumed
 MAY_CHANGE = ("trainer", "data.cache_dir", "data.workers", "picture", "plugins")
+# what of a run itself may change when it is resumed: its length, and its start before it began
+OF_THE_RUN = ("optim.epochs", "init")
+FREE = (*OF_THE_RUN, *MAY_CHANGE)
+
+log = logging.getLogger(__name__)
 
 
 class InUse(RunError):
@@ -95,11 +101,12 @@ def resumed_config(config: TrainConfig, overrides: list[str]) -> TrainConfig:
         raise RunError(f"resume={folder}: is not a folder")
     stored = read_run_config(folder)
     result, new = (OmegaConf.create(c.model_dump()) for c in (stored, config))
-    for override in overrides:
-        key = override.lstrip("+~").split("=")[0]
+    keys = [override.lstrip("+~").split("=")[0] for override in overrides]
+    allowed = [key for key in OF_THE_RUN if key in keys]
+    different = [key for key in differences(config, stored) if key not in allowed]
+    for key, override in zip(keys, overrides, strict=True):
         if key == "resume":
             continue
-        different = differences(config, stored)
         if key == "experiment":  # an experiment file may set anything
             contradicts = bool(different)
         else:
@@ -107,18 +114,31 @@ def resumed_config(config: TrainConfig, overrides: list[str]) -> TrainConfig:
         if contradicts:
             raise RunError(
                 f"{override} contradicts the run in {folder}; leave it out to resume the run, or "
-                f"leave out resume= to start another. Free to change: {', '.join(MAY_CHANGE)}"
+                f"leave out resume= to start another. Free to change: {', '.join(FREE)}"
             )
-        if may_change(key):
+        if key == "init" and config.init != stored.init and (folder / LAST).is_file():
+            log.warning(
+                "init=%s is ignored: the run in %s has checkpoints, and goes on from these. To "
+                "train from other weights, start another run, without resume=",
+                config.init,
+                folder,
+            )
+        elif may_change(key, resumed=True):
             OmegaConf.update(result, key, _value(new, key))
     result.resume = None
     return read_config(TrainConfig, result)
 
 
-def may_change(override: str) -> bool:
-    """Whether a key, or a key=value word, may change when a run is resumed."""
+def may_change(override: str, resumed: bool = False) -> bool:
+    """Whether a key, or a key=value word, may differ from the config in a run folder.
+
+    Args:
+        override: The key or word.
+        resumed: Whether the user names the run, with resume=, and so may also change the run.
+    """
     key = override.lstrip("+~").split("=")[0]
-    return any(key == free or key.startswith(free + ".") for free in MAY_CHANGE)
+    allowed = FREE if resumed else MAY_CHANGE
+    return any(key == free or key.startswith(free + ".") for free in allowed)
 
 
 def _value(config: DictConfig, key: str) -> Any:

@@ -99,7 +99,10 @@ class TrainConfig(Settings):
         description="true: every element of a spiral also carries its distance and angle"
     )
     seed: int = Field(ge=0, lt=2**32, description="seed of weights, order, spirals and dropout")
-    resume: Text | None = Field(description="folder of a stopped run to resume")
+    init: Text | None = Field(
+        description="start from the weights of a run folder or checkpoint, or of bundled"
+    )
+    resume: Text | None = Field(description="folder of a run to resume or to train longer")
     plugins: Plugins
     model: SerializeAsAny[BaseModel]
     neighbourhood: SerializeAsAny[BaseModel]
@@ -351,6 +354,7 @@ def upgraded(values: dict[str, Any]) -> dict[str, Any]:
         values["optim"].setdefault("soft_labels", None)
     values.setdefault("plugins", [])
     values.setdefault("picture", True)
+    values.setdefault("init", None)
     return values
 
 

@@ -17,7 +17,8 @@ from meshspiral.experiment.schema import MatchConfig, read_config
 from meshspiral.geometry.digest import digest
 from meshspiral.geometry.mesh import MeshError
 from meshspiral.matching.confidence import Distributions
-from meshspiral.matching.matcher import BUNDLED_RUN, MESH_STAGES, Labels, Matcher, nearest_vertices
+from meshspiral.matching.matcher import MESH_STAGES, Labels, Matcher, nearest_vertices
+from meshspiral.training.checkpoints import BUNDLED_RUN
 
 CONTENT = "map_confidence"  # part of the key: earlier versions wrote less, so it is done anew
 STAGES = ("reading", *MESH_STAGES)  # of a mesh file

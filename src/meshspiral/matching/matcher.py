@@ -33,10 +33,9 @@ from meshspiral.matching.confidence import (
     near_confidence,
     near_vertices,
 )
-from meshspiral.training.checkpoints import config_of, read_checkpoint, template_of
+from meshspiral.training.checkpoints import BUNDLED_RUN, config_of, read_checkpoint, template_of
 from meshspiral.training.predictor import Predictor
 
-BUNDLED_RUN = Path(__file__).parents[1] / "data" / "assets" / "bodies_run"
 MESH_STAGES = ("resampling", "descriptors", "neighbourhoods", "network", "refinement")
 Report = Callable[[str], None]  # is told each stage when it begins; not every mesh has all
 NEAR = 5.0  # mean edges of the template; labels further apart are not interpolated

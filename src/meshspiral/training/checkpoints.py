@@ -15,6 +15,8 @@ from meshspiral.experiment.run_folder import BEST, CONFIG, RunError
 from meshspiral.experiment.schema import ConfigError, TrainConfig, read_stored_config
 from meshspiral.geometry.mesh import Mesh
 
+BUNDLED_RUN = Path(__file__).parents[1] / "data" / "assets" / "bodies_run"
+
 
 class WholeFiles(TorchCheckpointIO):
     """Writes checkpoints that appear whole or not at all, also if the machine or the disk fails.

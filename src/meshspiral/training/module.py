@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 from typing import Any
 
@@ -13,7 +14,7 @@ from torch import Tensor, nn
 from meshspiral.evaluation.metrics import CorrespondenceError
 from meshspiral.evaluation.outcome import Result, result_of
 from meshspiral.experiment.run_folder import RunError
-from meshspiral.experiment.schema import TrainConfig, read_stored_config
+from meshspiral.experiment.schema import OptimSettings, TrainConfig, read_stored_config
 from meshspiral.geometry.digest import derived_seed
 from meshspiral.neighbourhoods import Neighbourhood
 from meshspiral.neighbourhoods.base import Batch
@@ -32,6 +33,26 @@ def build_network(config: TrainConfig, in_features: int, num_classes: int) -> Ne
     network = Network.registered[config.model.name]
     neighbourhood = Neighbourhood.of(config.neighbourhood)
     return network.build(config.model, neighbourhood, in_features, num_classes)
+
+
+def rate_factor(optim: OptimSettings, step: int, steps: int) -> float:
+    """The learning rate of a step, over the largest.
+
+    Cosine: linear from near 0 to 1 during warm-up, then half a cosine down to near 0. It depends on
+    the step and on the length of the run alone: a run that gets more epochs continues as if it had
+    had them from the start.
+
+    Args:
+        optim: The schedule and its warm-up.
+        step: Number of steps before this one.
+        steps: Number of steps of the run.
+    """
+    if optim.schedule == "constant":
+        return 1.0
+    warmup = max(1, round(optim.warmup * steps))
+    if step < warmup:
+        return (step + 1) / warmup
+    return 0.5 * (1 + math.cos(math.pi * (step - warmup) / max(1, steps - warmup)))
 
 
 CHECK_EVERY = 10  # steps between two checks of the loss on a GPU, each of which waits for it
@@ -70,6 +91,17 @@ class Correspondence(L.LightningModule):
         if stage == "fit" and self.optim.soft_labels is not None:
             kernel = self.distances.heat_kernel(self.optim.soft_labels)
             self.soft_labels = SoftLabels(*(torch.from_numpy(x).to(self.device) for x in kernel))
+
+    def on_train_start(self) -> None:
+        # A checkpoint brings the rate of its own schedule; this run may have more epochs. Where it
+        # has not, this is the rate that is set already.
+        for scheduler in (config.scheduler for config in self.trainer.lr_scheduler_configs):
+            rates = zip(scheduler.base_lrs, scheduler.lr_lambdas, strict=True)
+            scheduler._last_lr = [base * factor(scheduler.last_epoch) for base, factor in rates]
+            for group, rate in zip(
+                scheduler.optimizer.param_groups, scheduler._last_lr, strict=True
+            ):
+                group["lr"] = rate
 
     def on_train_batch_start(self, batch: Batch, batch_idx: int) -> None:
         # Dropout depends on seed, epoch and mesh alone, as all other random choices do, so that a
@@ -165,13 +197,6 @@ class Correspondence(L.LightningModule):
         if optim.schedule == "constant":
             return {"optimizer": adam}
         steps = max(1, int(self.trainer.estimated_stepping_batches))
-        warmup = max(1, round(optim.warmup * steps))
-
-        def factor(step: int) -> float:
-            """Linear from near 0 to 1, then half a cosine down to near 0."""
-            if step < warmup:
-                return (step + 1) / warmup
-            return 0.5 * (1 + math.cos(math.pi * (step - warmup) / max(1, steps - warmup)))
-
+        factor = functools.partial(rate_factor, optim, steps=steps)
         schedule = torch.optim.lr_scheduler.LambdaLR(adam, factor)
         return {"optimizer": adam, "lr_scheduler": {"scheduler": schedule, "interval": "step"}}

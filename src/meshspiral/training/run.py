@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -14,12 +15,14 @@ from meshspiral.data.datamodule import CorrespondenceData
 from meshspiral.data.sources import open_data
 from meshspiral.evaluation import summary
 from meshspiral.evaluation.outcome import Outcome, evenly
-from meshspiral.experiment.run_folder import BEST, ERRORS, LAST, RunError, write_metrics
+from meshspiral.experiment.run_folder import BEST, ERRORS, LAST, write_metrics
 from meshspiral.experiment.schema import TrainConfig, flat
 from meshspiral.neighbourhoods import Neighbourhood
 from meshspiral.training.callbacks import Speed
-from meshspiral.training.checkpoints import config_of, read_checkpoint
+from meshspiral.training.initial import InitialWeights
+from meshspiral.training.memory import estimate_memory, free_bytes_on, memory_lines
 from meshspiral.training.module import Correspondence
+from meshspiral.training.resume import Progress, check_checkpoint, store_changes
 from meshspiral.training.trainer import build_trainer
 
 log = logging.getLogger(__name__)
@@ -32,12 +35,14 @@ def train(config: TrainConfig, folder: Path) -> dict[str, float]:
         The content of metrics.json.
 
     Raises:
-        RunError: A checkpoint is damaged, or of another run.
+        RunError: A checkpoint is damaged, of another run, or does not fit.
         ConfigError: This machine lacks the device.
         DataError, MeshError: The data set cannot be used.
     """
     log.info("run folder: %s", folder)
+    last = folder / LAST if (folder / LAST).exists() else None
     data = open_data(config)
+    initial = InitialWeights(config, data.in_features) if config.init and last is None else None
     began = time.perf_counter()
     data.prepare()
     seconds = time.perf_counter() - began
@@ -49,11 +54,24 @@ def train(config: TrainConfig, folder: Path) -> dict[str, float]:
     parameters = sum(p.numel() for p in module.parameters() if p.requires_grad)
     for line in description_lines(config, data, parameters, trainer.precision, seconds):
         log.info(line)
+    for line in initial.load_into(module, data.shapes.template) if initial else ():
+        log.info(line)
 
-    last = folder / LAST if (folder / LAST).exists() else None
-    for checkpoint in (last, folder / BEST):
-        if last and checkpoint.exists():
-            check_checkpoint(checkpoint, config, trainer.world_size)
+    estimate = estimate_memory(module.net, data, trainer.precision)
+    device = trainer.strategy.root_device
+    for level, line in memory_lines(estimate, free_bytes_on(device), device.type):
+        log.log(level, line)
+
+    progress = None
+    if last:
+        if (folder / BEST).exists():
+            check_checkpoint(folder / BEST, config, trainer.world_size)
+        saved = check_checkpoint(last, config, trainer.world_size)
+        steps = math.ceil(len(data.datasets["train"]) / trainer.world_size)
+        progress = Progress.of(saved, config, steps)
+        log.info(progress.line(folder))
+    if trainer.is_global_zero:
+        store_changes(folder, config, progress)
     trainer.fit(module, datamodule=data, weights_only=True, ckpt_path=last)
     [tested] = trainer.test(
         module, datamodule=data, ckpt_path=folder / BEST, weights_only=True, verbose=False
@@ -84,31 +102,6 @@ def train(config: TrainConfig, folder: Path) -> dict[str, float]:
         log.info("Run folder:  %s", folder)
         log.info("TensorBoard: tensorboard --logdir %s", folder)
     return metrics
-
-
-def check_checkpoint(checkpoint: Path, config: TrainConfig, processes: int) -> None:
-    """Check that a checkpoint can be resumed with a config.
-
-    Raises:
-        RunError: It is damaged, of another network, or of a run in another number of processes,
-            whose epochs have another number of steps.
-    """
-    try:
-        saved = read_checkpoint(checkpoint)
-    except RunError as error:
-        raise RunError(f"{error}; delete the run's checkpoints to start it anew") from error
-    groups = ("model", "neighbourhood")
-    theirs = flat(config_of(saved, str(checkpoint)).model_dump(include=set(groups)))
-    for key, value in flat(config.model_dump(include=set(groups))).items():
-        if theirs.get(key) != value:
-            raise RunError(
-                f"{checkpoint} is of another run: {key} must be {value}, got {theirs.get(key)}"
-            )
-    if saved.get("processes", processes) != processes:
-        raise RunError(
-            f"{checkpoint} is of a run in {saved['processes']} processes, not {processes}: resume "
-            "it with the same trainer.devices"
-        )
 
 
 def description_lines(
