@@ -13,6 +13,7 @@ import torch
 from meshspiral.benchmarking.inputs import channels, network_of, torus_batch
 from meshspiral.benchmarking.measure import in_own_process
 from meshspiral.benchmarking.memory import pass_cost
+from meshspiral.data.descriptors import Features
 from meshspiral.neighbourhoods import Neighbourhood
 from meshspiral.nn.networks import FCSNet
 from meshspiral.training import memory
@@ -29,7 +30,7 @@ def a_network(overrides: list[str], vertices: int = VERTICES):
         datasets={"train": SimpleNamespace(items=[torus_batch(config, vertices, vertices)])},
         neighbourhood=Neighbourhood.of(config.neighbourhood),
         in_features=channels(config),
-        shot=config.data.shot,
+        features=Features.of(config.data),
         seed=0,
     )
     return config, network_of(config, vertices), data
