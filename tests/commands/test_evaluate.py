@@ -249,7 +249,7 @@ def test_plots_of_an_earlier_evaluation_are_removed(cli, moved):
     [
         (
             {"shot": {"bins": 8}},
-            {"root": "here", "labels": "x", "shot": {"radius": 0.3, "bins": 8}},
+            {"root": "here", "labels": "x", "shot": {"radius": 0.3, "bins": 8, "by_area": False}},
         ),
         ({"root": None, "workers": 2}, {"root": "here", "labels": "x", "workers": 2}),
         (

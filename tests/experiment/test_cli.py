@@ -105,7 +105,7 @@ def test_the_root_setting_metric_overrides_model_metric():
         (["+metric=maybe"], "metric must be true or false, got maybe"),
         (["seq_len=0"], "seq_len must be at least 1, got 0"),
         (["seq_len=many"], "seq_len must be a whole number, got many"),
-        (["model=foo"], "Could not find 'model/foo'; there are: fcs, gcnn3, lstm"),
+        (["model=foo"], "Could not find 'model/foo'; there are: conv, fcs, gcnn3, lstm"),
         (["data=foo"], "there are: bodies, bodies_6890, bodies_6890_remeshed, bodies_mixed,"),
         (["+metrics=true"], "unknown key metrics; did you mean metric?"),
         (["+rate=1"], "unknown key rate; known: seq_len"),
@@ -125,11 +125,11 @@ def test_the_root_setting_metric_overrides_model_metric():
         (["neighbourhood.rings=1"], "fcs needs sequences of one length, got spirals of 1 rings"),
         (
             ["neighbourhood=patch"],
-            "model fcs needs a neighbourhood that gives spirals (spiral), got neighbourhood patch",
+            "model fcs needs a neighbourhood that gives spirals (sampled, spiral), got neighbourhood patch",
         ),
         (["model.channels=[1,2,0]"], "model.channels must be three numbers of at least 1"),
         (["model.channels=[1,2,x]"], "model.channels must be a whole number, got x"),
-        (["neighbourhood=foo"], "Could not find 'neighbourhood/foo'; there are: patch, spiral"),
+        (["neighbourhood=foo"], "Could not find 'neighbourhood/foo'; there are: patch, sampled, spiral"),
         (["plugins=[no_such.module]"], "plugins: cannot import no_such.module (ModuleNotFound"),
         (["plugins=5"], "plugins must be a list of modules, got 5"),
         (["optim.lr=-1"], "optim.lr must be above 0, got -1"),
@@ -206,13 +206,13 @@ def test_help_shows_groups_settings_and_three_examples(cli):
     assert code == 0
     lines = [" ".join(line.split()) for line in out.splitlines()]
     for line in (
-        "model fcs, gcnn3, lstm",
-        "neighbourhood patch, spiral",
+        "model conv, fcs, gcnn3, lstm",
+        "neighbourhood patch, sampled, spiral",
         "trainer cpu, ddp, gpu",
         "data/remesh isotropic, mixed",
         "seq_len number of vertices N of a spiral",
         "optim.lr largest learning rate",
-        "model.metric read metric information: distance and angle (fcs, lstm)",
+        "model.metric read metric information: distance and angle (conv, fcs, lstm)",
         "neighbourhood.rays number of rays of the polar grid, even (patch)",
         "data.vertices vertices of the template and the bodies (bodies)",
     ):
@@ -260,7 +260,7 @@ def test_the_documented_commands_compose():
                 commands.append([w for w in words if "=" in w])
     assert len(commands) > 8
     for words in commands:
-        single = [w if w.startswith("data.") or "[" in w else w.split(",")[0] for w in words]
+        single = [w if "[" in w else w.split(",")[0] for w in words]
         if not any(word.startswith("resume") for word in words):
             composed(single)
 

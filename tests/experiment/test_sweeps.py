@@ -93,15 +93,15 @@ def test_a_failed_job_is_listed_and_retried(cli, toy_overrides, monkeypatch):
     command = [word for word in command if word != "data.shot.bins=4"]
     from meshspiral.data import preprocessing
 
-    real = preprocessing._descriptors
+    real = preprocessing._described
 
-    def fails(mesh, radius, bins):
-        if bins == 5:
+    def fails(descriptor, *inputs):
+        if descriptor.settings.bins == 5:
             raise RuntimeError("out of ink")
-        return real(mesh, radius, bins)
+        return real(descriptor, *inputs)
 
     with monkeypatch.context() as broken:
-        broken.setattr(preprocessing, "_descriptors", fails)
+        broken.setattr(preprocessing, "_described", fails)
         code, out, _ = cli(*command)
     assert code == 1
     [sweep] = Path("outputs/sweeps").iterdir()

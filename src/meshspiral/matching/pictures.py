@@ -11,7 +11,8 @@ from scipy.spatial.transform import Rotation
 from meshspiral.data.files import write_file
 from meshspiral.data.scans import Scan
 from meshspiral.geometry.mesh import Mesh
-from meshspiral.matching.job import FileMatch, LabelledScan
+from meshspiral.matching.job import FileMatch
+from meshspiral.matching.matcher import Labels
 from meshspiral.matching.transfer import transfer
 from meshspiral.viz.colors import GREY, confidence_colors, point_colors, template_colors
 from meshspiral.viz.plots import encoded, picture_figure
@@ -41,12 +42,12 @@ def draw_pictures(folder: Path, match: FileMatch, template: Mesh, up: str, requi
         target_colors = own_colors(target.scan)
         source_colors = transfer(target_colors, match.map, GREY)
         colors = [target.on_mesh(target_colors), source.on_mesh(source_colors)]
-        meshes = [align_to_template(target, template), align_to_template(source, template)]
+        meshes = [align_to_template(*each[:2], template) for each in (target, source)]
         confidences = [target.on_mesh(target.labels.near_confidence)]
     else:
         source_colors = point_colors(template, source.labels.points)
         colors = [template_colors(template), source.on_mesh(source_colors)]
-        meshes = [template, align_to_template(source, template)]
+        meshes = [template, align_to_template(*source[:2], template)]
         confidences = [np.ones(len(template.vertices))]
     confidences.append(source.on_mesh(match.source_confidence))
     rows = [Row(meshes, colors), Row(meshes, [confidence_colors(c) for c in confidences])]
@@ -74,14 +75,14 @@ def own_colors(scan: Scan) -> np.ndarray:
     return point_colors(scan.mesh, scan.vertices)
 
 
-def align_to_template(labelled: LabelledScan, template: Mesh) -> Mesh:
+def align_to_template(scan: Scan, labels: Labels, template: Mesh) -> Mesh:
     """The mesh of a scan, scaled, translated and rotated to fit its labels on the template.
 
     The mesh gets the template's area; the rotation is the best in the sense of least squares,
     weighted by confidence (Kabsch 1976).
     """
-    mesh, points = labelled.scan.mesh, labelled.on_mesh(labelled.labels.points)
-    weights = labelled.on_mesh(labelled.labels.confidence) + 1e-6  # never all zero
+    mesh, points = scan.mesh, labels.points[scan.origin]
+    weights = labels.confidence[scan.origin] + 1e-6  # never all zero
     vertices = mesh.vertices * np.sqrt(template.area / mesh.area)
     vertices -= np.average(vertices, axis=0, weights=weights)
     centred_points = points - np.average(points, axis=0, weights=weights)
