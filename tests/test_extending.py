@@ -108,6 +108,15 @@ def test_a_neighbourhood_is_a_module_and_a_yaml_file(clone, toy_overrides):
     assert (clone / "outputs/nearest/metrics.json").is_file()
 
 
+def test_a_descriptor_is_a_module(clone, toy_overrides):
+    quick = [*toy_overrides, "optim.epochs=1", "optim.warmup=0", "hydra.run.dir=outputs/defect"]
+    [train] = words_of("descriptor commands")
+    out = call(clone, [*train, *quick], ["src.train", "--help"])
+    assert "data.defect.steps        smoothing steps; each adds a channel" in out
+    config = (clone / "outputs/defect/config.yaml").read_text()
+    assert "defect:\n    steps: 3" in config
+
+
 def test_a_data_set_can_be_a_plugin(clone):
     """What happens without `plugins=` is tested in commands/test_plugins.py."""
     train, evaluate, report = words_of("plugin commands")

@@ -212,6 +212,8 @@ def test_help_shows_groups_settings_and_three_examples(cli):
         "data/remesh isotropic, mixed",
         "seq_len number of vertices N of a spiral",
         "optim.lr largest learning rate",
+        "data.shot.bins bins of the cosine; 16 give 544 channels",
+        "data.raw.rings number of rings of the polar grid",
         "model.metric read metric information: distance and angle (conv, fcs, lstm)",
         "neighbourhood.rays number of rays of the polar grid, even (patch)",
         "data.vertices vertices of the template and the bodies (bodies)",

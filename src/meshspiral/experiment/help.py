@@ -8,7 +8,8 @@ from pathlib import Path
 from omegaconf import OmegaConf
 from pydantic import BaseModel
 
-from meshspiral.data.settings import DataSettings, RemeshSettings, ShotSettings
+from meshspiral.data.descriptors import Descriptor
+from meshspiral.data.settings import DataSettings, RemeshSettings
 from meshspiral.experiment.program import command_line
 from meshspiral.experiment.schema import (
     GROUPS,
@@ -65,7 +66,7 @@ def settings_help(command: str, conf: Path) -> str:
             "optim.": OptimSettings,
             "trainer.": TrainerSettings,
             "data.": DataSettings,
-            "data.shot.": ShotSettings,
+            **{f"data.{name}.": each.Settings for name, each in Descriptor.registered.items()},
             "data.remesh.": RemeshSettings,
         }
         for prefix, schema in parts.items():
