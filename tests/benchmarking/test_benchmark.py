@@ -16,8 +16,8 @@ from meshspiral.benchmarking.products import ProductRecorder
 from meshspiral.benchmarking.reference import reference_loss, reference_network
 from meshspiral.benchmarking.table import table_lines
 from meshspiral.commands import benchmark
-from meshspiral.data.datamodule import draw
 from meshspiral.data.datasets.bodies import Bodies
+from meshspiral.data.tensors import draw
 from meshspiral.neighbourhoods import Neighbourhood
 from meshspiral.nn.networks import Network
 from tests.helpers import ROOT, composed

@@ -5,8 +5,8 @@ import pytest
 import torch
 
 from meshspiral.benchmarking.inputs import body_batch, torus, torus_batch
-from meshspiral.data.datamodule import draw
 from meshspiral.data.sources import open_data
+from meshspiral.data.tensors import draw
 from meshspiral.neighbourhoods import Neighbourhood
 from tests.helpers import composed
 

@@ -8,7 +8,7 @@ from torch.utils.flop_counter import FlopCounterMode
 from meshspiral.benchmarking.inputs import network_of, torus_batch
 from meshspiral.benchmarking.products import Product, ProductRecorder, replay
 from meshspiral.benchmarking.steps import training_loss, training_step
-from meshspiral.data.datamodule import draw
+from meshspiral.data.tensors import draw
 from meshspiral.neighbourhoods import Neighbourhood
 from meshspiral.nn.networks.base import LAST, LIFTED
 from tests.helpers import composed

@@ -7,7 +7,7 @@ from meshspiral.benchmarking import reference
 from meshspiral.benchmarking.inputs import network_of, torus_batch
 from meshspiral.benchmarking.reference import reference_loss, reference_network
 from meshspiral.benchmarking.steps import training_loss
-from meshspiral.data.datamodule import draw
+from meshspiral.data.tensors import draw
 from meshspiral.neighbourhoods import Neighbourhood
 from tests.helpers import ROOT, composed
 from tests.nn.test_geodesic import as_resampling, patches

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from meshspiral.commands.draw import main
-from meshspiral.data.datamodule import sequence_points
 from meshspiral.data.shapes import DataError
+from meshspiral.data.tensors import sequence_points
 from tests.meshes import bumpy_sphere
 from tests.neighbourhoods.made import patch, sampled, spiral
 

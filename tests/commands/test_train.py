@@ -18,9 +18,9 @@ import pytest
 import torch
 from omegaconf import OmegaConf
 
-from meshspiral.data.datamodule import draw
 from meshspiral.data.shapes import DataError
 from meshspiral.data.sources import open_data
+from meshspiral.data.tensors import draw
 from meshspiral.experiment.run_folder import (
     BEST,
     CONFIG,

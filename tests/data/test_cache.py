@@ -4,10 +4,10 @@ import logging
 import multiprocessing
 import os
 import time
-import zipfile
 
 import numpy as np
 import pytest
+from safetensors.numpy import save
 
 from meshspiral.data.cache import Cache, CacheError, code_version, digest
 from meshspiral.data.descriptors.shot import Shot
@@ -22,7 +22,7 @@ def cache(tmp_path):
     return Cache(tmp_path / "cache")
 
 
-ARRAYS = {"a": np.arange(12.0).reshape(3, 4), "b": np.array(["x", "yz"])}
+ARRAYS = {"a": np.arange(12.0).reshape(3, 4), "b": np.array(7)}
 
 
 def same(arrays):
@@ -33,7 +33,7 @@ def test_saved_arrays_are_loaded_and_no_other_file_is_left(cache):
     assert cache.load("kind", "key") is None
     cache.save("kind", "key", ARRAYS)
     assert same(cache.load("kind", "key"))
-    assert [p.name for p in cache.root.rglob("*") if p.is_file()] == ["key.npz"]
+    assert [p.name for p in cache.root.rglob("*") if p.is_file()] == ["key.safetensors"]
     assert cache.size() == cache.path("kind", "key").stat().st_size
 
 
@@ -61,7 +61,7 @@ def damage_empty(path):
 
 
 def damage_text(path):
-    path.write_text("not an archive")
+    path.write_text("not a tensor file")
 
 
 def damage_bit(path):
@@ -72,35 +72,20 @@ def damage_bit(path):
 
 
 def damage_foreign(path):
-    np.savez(path, key=np.array("another"), a=np.zeros(3))
+    path.write_bytes(save({"a": np.zeros(3)}, {"key": "another"}))
 
 
 def damage_another_array(path):
-    np.savez(path, key=np.array(["key", "a", "b"]), a=np.zeros(3), c=np.zeros(3))
-
-
-def damage_encrypted(path):
-    data = bytearray(path.read_bytes())
-    data[data.index(b"PK\x01\x02") + 8] |= 1  # the flag of an encrypted member
-    path.write_bytes(data)
+    path.write_bytes(save({"a": np.zeros(3), "c": np.zeros(3)}, {"key": "key"}))
 
 
 def damage_keyless(path):
-    np.savez(path, a=np.zeros(3))
+    path.write_bytes(save({"a": np.zeros(3)}))
 
 
 def damage_npy(path):
     with open(path, "wb") as file:
         np.save(file, np.zeros(3))
-
-
-def damage_pickle(path):
-    np.savez(path, key=np.array("key"), a=np.array([{}], dtype=object))
-
-
-def damage_zip(path):
-    with zipfile.ZipFile(path, "w") as archive:
-        archive.writestr("readme.txt", "hello")
 
 
 @pytest.mark.parametrize(
@@ -113,10 +98,7 @@ def damage_zip(path):
         damage_foreign,
         damage_keyless,
         damage_another_array,
-        damage_encrypted,
         damage_npy,
-        damage_pickle,
-        damage_zip,
     ],
 )
 def test_a_damaged_or_foreign_file_is_computed_again_with_a_warning(cache, damage, caplog):
@@ -124,12 +106,15 @@ def test_a_damaged_or_foreign_file_is_computed_again_with_a_warning(cache, damag
     damage(cache.path("kind", "key"))
     with caplog.at_level(logging.WARNING):
         assert same(cache.get("kind", "key", lambda: ARRAYS))
-    assert "computing it again" in caplog.text and "key.npz" in caplog.text
+    assert "computing it again" in caplog.text and "key.safetensors" in caplog.text
     assert same(cache.load("kind", "key"))
 
 
 def test_a_crash_while_writing_leaves_no_file(cache, monkeypatch):
-    monkeypatch.setattr(np, "savez", lambda *a, **k: (_ for _ in ()).throw(KeyboardInterrupt))
+    def interrupted(source, target):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(os, "replace", interrupted)
     with pytest.raises(KeyboardInterrupt):
         cache.save("kind", "key", ARRAYS)
     assert not [p for p in cache.root.rglob("*") if p.is_file()]
@@ -138,14 +123,13 @@ def test_a_crash_while_writing_leaves_no_file(cache, monkeypatch):
 def test_a_full_disk_gives_one_message_and_loses_no_result(cache, monkeypatch):
     cache.save("kind", "old", ARRAYS)
 
-    def full(file, **arrays):
-        file.write(b"half")
+    def full(source, target):
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(np, "savez", full)
+    monkeypatch.setattr(os, "replace", full)
     with pytest.raises(CacheError, match=r"cannot write the cache .*No space left.*cache_dir="):
         cache.save("kind", "new", ARRAYS)
-    assert [p.name for p in cache.root.rglob("*") if p.is_file()] == ["old.npz"]
+    assert [p.name for p in cache.root.rglob("*") if p.is_file()] == ["old.safetensors"]
 
 
 def test_an_unwritable_folder_gives_one_message(tmp_path):
@@ -173,7 +157,7 @@ def test_two_processes_can_write_the_same_key(cache, caplog):
     assert all(writer.exitcode == 0 for writer in writers)
     assert cache.load("kind", "key") is not None and all(len(values) == 1 for values in seen)
     assert seen and "damaged" not in caplog.text
-    assert [p.name for p in cache.root.rglob("*") if p.is_file()] == ["key.npz"]
+    assert [p.name for p in cache.root.rglob("*") if p.is_file()] == ["key.safetensors"]
 
 
 def tasks():
@@ -201,7 +185,7 @@ def test_eight_processes_share_a_cold_cache_and_one_is_killed(tmp_path, caplog):
         process.start()
     assert started.acquire(timeout=300)
     end = time.monotonic() + 300
-    while not any((tmp_path / "all").rglob("*.npz")):  # until the first result is written
+    while not any((tmp_path / "all").rglob("*.safetensors")):  # until the first result is written
         assert time.monotonic() < end
     processes[0].kill()  # at a random point of its work
     for process in processes:

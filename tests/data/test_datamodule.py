@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from meshspiral.data import preprocessing
+from meshspiral.data import pool, preprocessing
 from meshspiral.data.cache import Cache
 from meshspiral.data.datamodule import CorrespondenceData, EpochSampler
 from meshspiral.data.descriptors import Features
@@ -120,7 +120,7 @@ def test_items_hold_descriptors_spirals_and_labels(cache):
 
 def test_meshes_of_one_connectivity_share_one_table(cache):
     data = prepared(cache)
-    tables = {item["sequences"].data_ptr() for d in data.datasets.values() for item in d.items}
+    tables = {item["sequences"].data_ptr() for d in data.datasets.values() for item in d}
     assert len(tables) == 1 and len(list((cache.root / "spiral").iterdir())) == 1
 
 
@@ -171,9 +171,7 @@ def test_processes_divide_an_epoch_among_them(size, world):
 def test_renumbered_meshes_give_renumbered_tensors(cache):
     """Descriptors, labels and spirals are renumbered with the vertices."""
     original, shuffled = prepared(cache), prepared(cache, shuffle_vertices=True)
-    for a, b in zip(
-        original.datasets["train"].items, shuffled.datasets["train"].items, strict=True
-    ):
+    for a, b in zip(original.datasets["train"], shuffled.datasets["train"], strict=True):
         order = b["labels"]  # shuffled vertex i is original vertex order[i]
         assert not torch.equal(order, a["labels"]) and torch.equal(order.sort()[0], a["labels"])
         torch.testing.assert_close(b["vertices"], a["vertices"][order])
@@ -188,7 +186,7 @@ def test_renumbered_meshes_give_renumbered_tensors(cache):
 
 
 def test_every_mesh_has_its_own_reproducible_permutation(cache):
-    once, twice = (prepared(cache, shuffle_vertices=True).datasets["train"].items for _ in range(2))
+    once, twice = (prepared(cache, shuffle_vertices=True).datasets["train"] for _ in range(2))
     assert all(torch.equal(a["labels"], b["labels"]) for a, b in zip(once, twice, strict=True))
     assert not torch.equal(once[0]["labels"], once[1]["labels"])
 
@@ -260,7 +258,9 @@ class Backwards(Spiral):
 def test_a_damaged_cache_file_is_recomputed(cache, caplog):
     before = prepared(cache).datasets["val"][0]["features"]
     for path in (cache.root / "shot").iterdir():
-        path.write_bytes(path.read_bytes()[:1000])
+        content = path.read_bytes()[:1000]
+        path.unlink()  # the old file is still mapped
+        path.write_bytes(content)
     with caplog.at_level(logging.WARNING):
         assert torch.equal(prepared(cache).datasets["val"][0]["features"], before)
     assert "computing it again" in caplog.text
@@ -269,21 +269,20 @@ def test_a_damaged_cache_file_is_recomputed(cache, caplog):
 def test_the_pool_gives_the_results_of_one_process(tmp_path, monkeypatch):
     alone = prepared(Cache(tmp_path / "alone"))
     clock = iter(range(0, 10**6, 100))  # all tasks seem slow
-    monkeypatch.setattr(preprocessing.time, "perf_counter", lambda: next(clock))
+    monkeypatch.setattr(pool.time, "perf_counter", lambda: next(clock))
     data = CorrespondenceData(Toy(), FEATURES, spiral(8), Cache(tmp_path / "pool"), workers=2)
     started = []
-    run_in_pool = preprocessing.run_in_pool
 
-    def pool(function, jobs, *rest):
+    def recorded_pool(function, jobs, *rest):
         jobs = list(jobs)
         started.append(len(jobs))
         return run_in_pool(function, jobs, *rest)
 
-    monkeypatch.setattr(preprocessing, "run_in_pool", pool)
+    monkeypatch.setattr(pool, "run_in_pool", recorded_pool)
     data.prepare()
-    assert started == [11]  # twelve descriptors and one spiral table, less the first two
+    assert started == [10]  # twelve meshes, less the first two
     for split in TOY_SPLIT:
-        for a, b in zip(data.datasets[split].items, alone.datasets[split].items, strict=True):
+        for a, b in zip(data.datasets[split], alone.datasets[split], strict=True):
             assert torch.equal(a["features"], b["features"])
 
 
@@ -299,7 +298,7 @@ def test_undefined_descriptors_become_zeros_and_are_counted_once(cache, caplog):
     shapes["train/0.ply"] = Mesh(far, np.delete(mesh.faces, lost, axis=0))
     with caplog.at_level(logging.WARNING):
         data = prepared(cache, shapes=shapes)
-    features = data.datasets["train"].items[0]["features"]
+    features = data.datasets["train"][0]["features"]
     assert torch.isfinite(features).all() and (features[0] == 0).all()
     assert caplog.text.count("SHOT is undefined at 1 of 162 vertices; using zeros") == 1
     assert "train/0.ply" in caplog.text
@@ -329,7 +328,7 @@ def test_a_mesh_far_from_the_origin_has_the_same_descriptors(cache):
 def test_a_mesh_far_from_the_origin_has_the_same_metric_information(cache):
     near = toy_shapes()
     far = {name: Mesh(mesh.vertices + 4e6, mesh.faces) for name, mesh in near.items()}
-    one, two = (prepared(cache, shapes=shapes).datasets["val"].items[0] for shapes in (near, far))
+    one, two = (prepared(cache, shapes=shapes).datasets["val"][0] for shapes in (near, far))
     spirals = one["sequences"][one["first"][:-1]].long()
     one, two = (metric_features(item["vertices"], spirals, item["unit"]) for item in (one, two))
     torch.testing.assert_close(one, two, rtol=0, atol=1e-5)

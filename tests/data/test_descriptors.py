@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import pickle
+
 import numpy as np
 import pytest
 
@@ -112,3 +114,9 @@ def test_shot_by_area_changes_less_where_vertices_are_added():
         ours, theirs = described(mesh, shot), described(dense, shot)[: len(mesh.vertices)]
         distances.append(np.median(np.linalg.norm(ours - theirs, axis=1)))
     assert distances[1] < 0.7 * distances[0]
+
+
+def test_settings_with_descriptors_are_pickled(toy_overrides):
+    """For processes of their own."""
+    config = composed(toy_overrides)
+    assert pickle.loads(pickle.dumps(config)) == config

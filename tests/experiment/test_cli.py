@@ -125,11 +125,14 @@ def test_the_root_setting_metric_overrides_model_metric():
         (["neighbourhood.rings=1"], "fcs needs sequences of one length, got spirals of 1 rings"),
         (
             ["neighbourhood=patch"],
-            "model fcs needs a neighbourhood that gives spirals (sampled, spiral), got neighbourhood patch",
+            "needs a neighbourhood that gives spirals (sampled, spiral), got neighbourhood patch",
         ),
         (["model.channels=[1,2,0]"], "model.channels must be three numbers of at least 1"),
         (["model.channels=[1,2,x]"], "model.channels must be a whole number, got x"),
-        (["neighbourhood=foo"], "Could not find 'neighbourhood/foo'; there are: patch, sampled, spiral"),
+        (
+            ["neighbourhood=foo"],
+            "'neighbourhood/foo'; there are: patch, sampled, spiral",
+        ),
         (["plugins=[no_such.module]"], "plugins: cannot import no_such.module (ModuleNotFound"),
         (["plugins=5"], "plugins must be a list of modules, got 5"),
         (["optim.lr=-1"], "optim.lr must be above 0, got -1"),

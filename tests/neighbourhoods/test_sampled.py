@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 import torch
 
-from meshspiral.data.datamodule import mesh_tensors
 from meshspiral.data.descriptors import Features
 from meshspiral.data.descriptors.xyz import Xyz
+from meshspiral.data.tensors import mesh_tensors
 from meshspiral.geometry.sampling import nearest_corners, sampled_places, surface_directions
 from meshspiral.geometry.shot import local_frames
 from meshspiral.neighbourhoods.sampled import turned_columns

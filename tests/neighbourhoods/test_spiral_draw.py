@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 import torch
 
-from meshspiral.data.datamodule import draw, mesh_tensors
 from meshspiral.data.descriptors import Features
 from meshspiral.data.descriptors.xyz import Xyz
+from meshspiral.data.tensors import draw, mesh_tensors
 from meshspiral.geometry.mesh import Mesh
 from meshspiral.geometry.sampling import nearest_neighbours
 from meshspiral.geometry.shot import local_frames

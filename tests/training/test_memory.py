@@ -23,11 +23,21 @@ from tests.helpers import composed, run, same_weights
 VERTICES = 1500
 
 
+class OneMesh(list):
+    """What the estimate reads of a data set with one mesh."""
+
+    kept = 0
+
+    @property
+    def sizes(self) -> np.ndarray:
+        return np.array([len(self[0]["labels"])])
+
+
 def a_network(overrides: list[str], vertices: int = VERTICES):
     """A network, and what the estimate reads of a data module with one mesh."""
     config = composed(overrides)
     data = SimpleNamespace(
-        datasets={"train": SimpleNamespace(items=[torus_batch(config, vertices, vertices)])},
+        datasets={"train": OneMesh([torus_batch(config, vertices, vertices)])},
         neighbourhood=Neighbourhood.of(config.neighbourhood),
         in_features=channels(config),
         features=Features.of(config.data),
@@ -61,8 +71,8 @@ def test_the_estimate_agrees_with_the_measured_peak_of_a_pass(overrides, least, 
 def test_long_spirals_are_foreseen_without_taking_their_memory():
     """Twenty gigabytes on 1500 vertices, from a pass that takes a hundredth of them."""
     _, net, data = a_network(["model=lstm", "seq_len=1400", "model.channels=[20,30,40]"], 42)
-    item = data.datasets["train"].items[0]
-    data.datasets["train"].items = [{**item, "labels": torch.zeros(VERTICES, dtype=torch.int64)}]
+    [item] = data.datasets["train"]
+    data.datasets["train"][0] = {**item, "labels": torch.zeros(VERTICES, dtype=torch.int64)}
     tallies = []
     original = memory._Tally.__exit__
 

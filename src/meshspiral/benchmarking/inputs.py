@@ -6,11 +6,11 @@ import numpy as np
 import torch
 from lightning.fabric.utilities import move_data_to_device
 
-from meshspiral.data.datamodule import described_tensors, mesh_tensors, neighbourhood_tensors
 from meshspiral.data.descriptors import Features
 from meshspiral.data.preprocessing import compute_task, neighbourhood_task
 from meshspiral.data.shapes import Shape
 from meshspiral.data.sources import open_shapes
+from meshspiral.data.tensors import described_tensors, mesh_tensors, neighbourhood_tensors
 from meshspiral.experiment.schema import TrainConfig
 from meshspiral.geometry.mesh import Mesh
 from meshspiral.neighbourhoods import Neighbourhood

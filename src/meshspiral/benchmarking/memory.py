@@ -11,7 +11,7 @@ from meshspiral.benchmarking.inputs import network_of, torus_batch
 from meshspiral.benchmarking.measure import Row, in_own_process, peak_bytes
 from meshspiral.benchmarking.reference import reference_loss, reference_network
 from meshspiral.benchmarking.steps import training_loss
-from meshspiral.data.datamodule import draw
+from meshspiral.data.tensors import draw
 from meshspiral.experiment.schema import BenchmarkConfig, TrainConfig, load_plugins
 from meshspiral.neighbourhoods import Neighbourhood
 from meshspiral.training.device import set_up_process

@@ -11,7 +11,7 @@ from tqdm import tqdm
 from meshspiral.benchmarking.inputs import network_of, torus_batch
 from meshspiral.benchmarking.measure import Action, Row, in_own_process, medians, peak_bytes
 from meshspiral.benchmarking.memory import too_large
-from meshspiral.data.datamodule import draw
+from meshspiral.data.tensors import draw
 from meshspiral.experiment.schema import BenchmarkConfig, TrainConfig, load_plugins
 from meshspiral.neighbourhoods import Neighbourhood
 from meshspiral.nn.loss import linear_cross_entropy

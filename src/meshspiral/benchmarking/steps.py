@@ -13,7 +13,7 @@ from meshspiral.benchmarking.inputs import body_batch, network_of
 from meshspiral.benchmarking.measure import Action, Row, medians
 from meshspiral.benchmarking.products import ProductRecorder, replay
 from meshspiral.benchmarking.reference import reference_loss, reference_network
-from meshspiral.data.datamodule import draw
+from meshspiral.data.tensors import draw
 from meshspiral.experiment.schema import BenchmarkConfig, TrainConfig
 from meshspiral.neighbourhoods import Neighbourhood
 from meshspiral.neighbourhoods.base import Batch

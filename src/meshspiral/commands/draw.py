@@ -16,10 +16,10 @@ KINDS = ("png", "pdf")
 def main(config: DrawConfig) -> None:
     import numpy as np
 
-    from meshspiral.data.datamodule import sequence_points
     from meshspiral.data.files import write_file
     from meshspiral.data.remeshed import Remeshed
     from meshspiral.data.sources import open_shapes
+    from meshspiral.data.tensors import sequence_points
     from meshspiral.neighbourhoods import Neighbourhood
     from meshspiral.viz.plots import encoded, neighbourhood_figure
 

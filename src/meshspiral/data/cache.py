@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import inspect
 import logging
-import zipfile
 import zlib
 from collections.abc import Callable
 from functools import cache
@@ -12,12 +11,15 @@ from pathlib import Path
 from types import ModuleType
 
 import numpy as np
+from safetensors import SafetensorError, safe_open
+from safetensors.numpy import save as serialize
 
-from meshspiral.data.files import atomic_file
+from meshspiral.data.files import write_file
 from meshspiral.geometry.digest import digest
 from meshspiral.neighbourhoods.base import Arrays
 
 log = logging.getLogger(__name__)
+SUFFIX = ".safetensors"
 
 
 class CacheError(OSError):
@@ -31,7 +33,7 @@ def code_version(*modules: ModuleType) -> str:
 
 
 class Cache:
-    """A folder of .npz files, one per result, named by kind and key.
+    """A folder of safetensors files, one per result, named by kind and key.
 
     Several processes may share one folder: files are written atomically, and two processes that
     compute the same key write equal arrays. A truncated, damaged or foreign file is reported with a
@@ -46,34 +48,39 @@ class Cache:
 
     def path(self, kind: str, key: str) -> Path:
         """The file of a result, whether or not it exists."""
-        return self.root / kind / f"{key}.npz"
+        return self.root / kind / f"{key}{SUFFIX}"
 
     def has(self, kind: str, key: str) -> bool:
         """Whether there is a file for a result; its content is not checked."""
         return self.path(kind, key).is_file()
 
-    def load(self, kind: str, key: str) -> Arrays | None:
-        """Load the arrays of a result; None if its file is missing, damaged or foreign."""
+    def load(self, kind: str, key: str, check: bool = True) -> Arrays | None:
+        """Load the arrays of a result; None if its file is missing, damaged or foreign.
+
+        The file is mapped into memory: its pages are read when they are used, and processes of one
+        machine share them. Changes of the arrays do not reach the file.
+
+        Args:
+            kind: Kind of the result.
+            key: Its key.
+            check: Read everything and compare it with its checksum. Otherwise a file that is too
+                short, or not a result of this name, is still recognised.
+        """
         path = self.path(kind, key)
         try:
-            with np.load(path, allow_pickle=False) as file:
-                arrays = {name: file[name] for name in file.files}  # reading checks the CRC
+            with safe_open(path, framework="pt") as file:
+                arrays = {name: file.get_tensor(name).numpy() for name in file.keys()}  # noqa: SIM118
+                about = file.metadata() or {}
         except FileNotFoundError:
             return None
-        except (
-            OSError,
-            ValueError,
-            EOFError,
-            KeyError,
-            TypeError,
-            RuntimeError,
-            zipfile.BadZipFile,
-            zlib.error,
-        ) as error:
+        except (OSError, ValueError, KeyError, TypeError, RuntimeError, SafetensorError) as error:
             log.warning("%s is damaged (%s); computing it again", path, error)
             return None
-        if arrays.pop("key", np.array([])).tolist() != [key, *sorted(arrays)]:
+        if about.get("key") != key:
             log.warning("%s holds another result than its name says; computing it again", path)
+            return None
+        if check and about.get("crc32") != _checksum(arrays):
+            log.warning("%s is damaged (wrong checksum); computing it again", path)
             return None
         return arrays
 
@@ -83,11 +90,19 @@ class Cache:
         Raises:
             CacheError: The folder cannot be written.
         """
-        path = self.path(kind, key)
+        arrays = {name: np.asarray(array, order="C") for name, array in arrays.items()}
+        content = serialize(arrays, {"key": key, "crc32": _checksum(arrays)})
+        self.write(self.path(kind, key), content)
+
+    def write(self, path: Path, content: str | bytes) -> None:
+        """Write a file of the cache, whole or not at all.
+
+        Raises:
+            CacheError: The folder cannot be written.
+        """
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
-            with atomic_file(path) as file:
-                np.savez(file, key=np.array([key, *sorted(arrays)]), **arrays)
+            write_file(path, content)
         except OSError as error:
             reason = error.strerror or error
             raise CacheError(
@@ -95,18 +110,19 @@ class Cache:
                 "permissions, or choose another folder with data.cache_dir=/path/to/folder"
             ) from error
 
-    def get(self, kind: str, key: str, compute: Callable[[], Arrays]) -> Arrays:
+    def get(self, kind: str, key: str, compute: Callable[[], Arrays], check: bool = True) -> Arrays:
         """Load the arrays of a result, or compute and save them.
 
         Args:
             kind: Kind of the result, the name of a subfolder.
             key: Hash of everything that the result depends on.
             compute: Computes the arrays.
+            check: See `load`.
 
         Raises:
             CacheError: The folder cannot be written.
         """
-        arrays = self.load(kind, key)
+        arrays = self.load(kind, key, check)
         if arrays is None:
             arrays = compute()
             self.save(kind, key, arrays)
@@ -115,9 +131,16 @@ class Cache:
     def size(self) -> int:
         """Total size of all results in bytes."""
         total = 0
-        for path in self.root.rglob("*.npz"):
+        for path in self.root.rglob(f"*{SUFFIX}"):
             try:
                 total += path.stat().st_size
             except OSError:  # another process is replacing it
                 continue
         return total
+
+
+def _checksum(arrays: Arrays) -> str:
+    value = 0
+    for name in sorted(arrays):
+        value = zlib.crc32(arrays[name].data, value)
+    return str(value)

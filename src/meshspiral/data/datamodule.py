@@ -2,131 +2,33 @@
 
 from __future__ import annotations
 
-import logging
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from functools import cached_property
-from itertools import chain
+from itertools import islice
 
 import lightning as L
 import numpy as np
 import torch
-from scipy.sparse import csr_array
+from torch.utils._pytree import tree_leaves
 from torch.utils.data import DataLoader, Dataset, Sampler
-from tqdm import tqdm
 
 from meshspiral.data.cache import Arrays, Cache
 from meshspiral.data.descriptors import Features
-from meshspiral.data.preprocessing import (
-    compute_task,
-    descriptor_task,
-    frame_task,
-    load_task,
-    neighbourhood_task,
-    run_tasks,
-)
+from meshspiral.data.prepared import Prepared, Recipe
 from meshspiral.data.reference import ReferenceDistances
 from meshspiral.data.shapes import SPLITS, DataError, Shape, ShapeSet
-from meshspiral.geometry.digest import derived_seed
-from meshspiral.geometry.mesh import Mesh
+from meshspiral.data.tensors import draw
 from meshspiral.neighbourhoods import Neighbourhood
 from meshspiral.neighbourhoods.base import Batch
 
-log = logging.getLogger(__name__)
-
-
-def draw(
-    neighbourhood: Neighbourhood, batch: Batch, *purpose: int | str, training: bool = False
-) -> Batch:
-    """The batch with the neighbourhoods drawn, by chance that depends on (purpose, mesh) alone.
-
-    Args:
-        neighbourhood: Whose tensors the batch holds.
-        batch: An item of `MeshDataset`, on any device.
-        *purpose: For instance the seed and the epoch.
-        training: Whether the batch is trained on.
-    """
-    generator = torch.Generator(batch["features"].device)
-    generator.manual_seed(derived_seed(*purpose, batch["index"]))
-    return neighbourhood.draw(batch, generator, training)
-
-
-def described_tensors(arrays: Sequence[Arrays], mesh: Mesh, features: Features) -> Batch:
-    """`features`, `vertices` and `unit` of `MeshDataset`.
-
-    Args:
-        arrays: The result of the `descriptor_task` of each descriptor.
-        mesh: The mesh that was described.
-        features: The descriptors.
-    """
-    columns = [torch.from_numpy(described["features"]) for described in arrays]
-    return {
-        "features": columns[0] if len(columns) == 1 else torch.cat(columns, dim=1),
-        "vertices": torch.from_numpy(mesh.centred.astype(np.float32)),
-        "unit": torch.tensor(features.unit * np.sqrt(mesh.area), dtype=torch.float32),
-    }
-
-
-def mesh_tensors(mesh: Mesh, features: Features, neighbourhood: Neighbourhood) -> Batch:
-    """All entries of `MeshDataset` but the labels, for one mesh, without the cache."""
-    tasks = [descriptor_task(mesh, descriptor) for descriptor in features.descriptors]
-    described = [compute_task(task) for task in tasks]
-    arrays = compute_task(neighbourhood_task(mesh, neighbourhood))
-    batch = described_tensors(described, mesh, features)
-    return batch | neighbourhood_tensors(mesh, neighbourhood, arrays)
-
-
-def neighbourhood_tensors(
-    mesh: Mesh, neighbourhood: Neighbourhood, arrays: Arrays, cache: Cache | None = None
-) -> Batch:
-    """The tensors of a neighbourhood for one mesh.
-
-    Args:
-        mesh: The surface.
-        neighbourhood: Whose `tensors` are wanted.
-        arrays: The result of its `neighbourhood_task`.
-        cache: Where local frames are read from, or computed into; None for no cache.
-    """
-    if neighbourhood.frame is None:
-        return neighbourhood.tensors(arrays, mesh)
-    task = frame_task(mesh, neighbourhood.frame)
-    frames = compute_task(task) if cache is None else load_task(task, cache)
-    return neighbourhood.tensors(arrays, mesh, frames["frames"])
-
-
-def sequence_points(mesh: Mesh, neighbourhood: Neighbourhood, vertex: int) -> np.ndarray:
-    """The points that the sequence around one vertex visits, as in an evaluation.
-
-    Args:
-        mesh: The surface.
-        neighbourhood: One that gives `spirals`.
-        vertex: The centre.
-
-    Returns:
-        float64 [N, 3], without padding; of the first layer if layers differ.
-
-    Raises:
-        DataError: The neighbourhood gives no sequences.
-    """
-    if neighbourhood.gives != "spirals":
-        raise DataError(f"{neighbourhood.name} has no sequences; it gives {neighbourhood.gives}")
-    arrays = compute_task(neighbourhood_task(mesh, neighbourhood))
-    batch = neighbourhood_tensors(mesh, neighbourhood, arrays)
-    batch = draw(neighbourhood, {**batch, "features": torch.zeros(1), "index": 0}, 0)
-    spirals, places = batch["spirals"], batch.get("places")
-    if isinstance(spirals, tuple):
-        spirals, places = spirals[0], places and places[0]
-    row = spirals[vertex].numpy()
-    row = row[row >= 0]
-    if places is None:
-        return mesh.vertices[row]
-    shape = (len(places["first"]) - 1, len(mesh.vertices))
-    blend = csr_array((places["weights"], places["vertices"], places["first"]), shape=shape)
-    return (blend @ mesh.vertices)[row]
+KEPT = 2**29  # bytes of a split that stay in memory
 
 
 class MeshDataset(Dataset):
     """The tensors of one split. Item i is a dictionary, without a batch dimension.
+
+    Items are read when they are asked for. The first ones stay in memory, up to `KEPT` bytes.
 
     Entries:
         features: float32 [V, C], the descriptors.
@@ -137,16 +39,41 @@ class MeshDataset(Dataset):
         corners, weights: int64 [V, 3] and float64 [V, 3], only where the true point lies within a
             face of the template: its vertices, and barycentric coordinates.
         and those that the neighbourhood's `tensors` returns.
+
+    Args:
+        recipe: By which items are read.
+        prepared: The shapes of the split.
+        tables: Keys of the tables that several shapes have, with the tables once they are read.
+
+    Attributes:
+        names: Names of the shapes.
+        sizes: Their numbers of vertices, int64 [M].
+        kept: Bytes of the items in memory.
     """
 
-    def __init__(self, names: list[str], items: list[Batch]):
-        self.names, self.items = names, items
+    def __init__(
+        self, recipe: Recipe, prepared: Sequence[Prepared], tables: dict[str, Arrays | None]
+    ):
+        self.names = [each.name for each in prepared]
+        self.sizes = np.array([each.vertices for each in prepared])
+        self._recipe, self._prepared = recipe, prepared
+        self._items: dict[int, Batch] = {}
+        self.kept, self._tables = 0, tables
 
     def __len__(self) -> int:
-        return len(self.items)
+        return len(self._prepared)
 
     def __getitem__(self, i: int) -> Batch:
-        return {**self.items[i], "index": i}
+        if i not in range(len(self)):
+            raise IndexError(f"{i} must be an item, 0..{len(self) - 1}")
+        item = self._items.get(i)
+        if item is None:
+            item = self._recipe.read(self._prepared[i], self._tables)
+            size = sum(t.nbytes for t in tree_leaves(item) if isinstance(t, torch.Tensor))
+            if self.kept + size <= KEPT:
+                self.kept += size
+                self._items[i] = item
+        return {**item, "index": i}
 
 
 class EpochSampler(Sampler[int]):
@@ -198,6 +125,9 @@ class CorrespondenceData(L.LightningDataModule):
         seed: Seed of the order of meshes and of all draws.
         shuffle_vertices: Renumber the vertices of every mesh at random when it is read.
         workers: Number of processes that compute what is not cached; None for one per core.
+        half: Keep descriptors as float16 in the cache.
+        readers: Number of processes that read meshes ahead of the steps; None for one if the
+            meshes do not fit into `KEPT` bytes of memory, else none.
     """
 
     def __init__(
@@ -209,11 +139,15 @@ class CorrespondenceData(L.LightningDataModule):
         seed: int = 0,
         shuffle_vertices: bool = False,
         workers: int | None = None,
+        half: bool = False,
+        readers: int | None = None,
     ):
         super().__init__()
         self.shapes, self.features = shapes, features
         self.neighbourhood, self.cache = neighbourhood, cache
-        self.seed, self.shuffle_vertices, self.workers = seed, shuffle_vertices, workers
+        self.seed, self.workers, self.readers = seed, workers, readers
+        shuffle = seed if shuffle_vertices else None
+        self.recipe = Recipe(shapes, features, neighbourhood, cache, shuffle, half)
         self.datasets: dict[str, MeshDataset] = {}
         self._skip = 0
 
@@ -225,7 +159,7 @@ class CorrespondenceData(L.LightningDataModule):
     @property
     def resolution(self) -> int:
         """The median number of vertices of a training mesh."""
-        return int(np.median([len(item["labels"]) for item in self.datasets["train"].items]))
+        return int(np.median(self.datasets["train"].sizes))
 
     @property
     def in_features(self) -> int:
@@ -239,11 +173,7 @@ class CorrespondenceData(L.LightningDataModule):
 
     def shape(self, name: str) -> Shape:
         """A shape as it is served: renumbered if `shuffle_vertices` is true."""
-        shape = self.shapes.load(name)
-        if not self.shuffle_vertices:
-            return shape
-        rng = np.random.default_rng(derived_seed(self.seed, "shuffle", name))
-        return shape.renumbered(rng.permutation(len(shape.labels)))
+        return self.recipe.shape(name)
 
     def setup(self, stage: str | None = None) -> None:
         splits = {"fit": ("train", "val"), "validate": ("val",), "test": ("test",)}
@@ -251,7 +181,7 @@ class CorrespondenceData(L.LightningDataModule):
         self.prepare(wanted)
 
     def prepare(self, wanted: list[str] | tuple[str, ...] = SPLITS) -> None:
-        """Read the meshes of these splits, compute what is not cached, and load everything.
+        """Compute what is not cached for these splits.
 
         Raises:
             DataError: A split has no mesh, or a shape is wrong.
@@ -261,66 +191,20 @@ class CorrespondenceData(L.LightningDataModule):
         for split in wanted:
             if not self.shapes.names[split]:
                 raise DataError(f"the split {split} must have at least 1 mesh, got 0")
-        names = [(split, name) for split in wanted for name in self.shapes.names[split]]
-        self.shapes.prepare([name for _, name in names])
-        shapes, tasks = [], []
-        for _, name in tqdm(names, desc="Meshes", unit="mesh", delay=1.0):
-            shape = self.shape(name)
-            self._check_size(name, len(shape.labels))
-            shapes.append(shape)
-            described = [descriptor_task(shape.mesh, each) for each in self.features.descriptors]
-            tasks.append((*described, neighbourhood_task(shape.mesh, self.neighbourhood)))
-        what = f"Descriptors and {self.neighbourhood.noun}"
-        run_tasks(chain(*tasks), self.cache, self.workers, what)
-        repeated = Counter(table.key for *_, table in tasks)
-        loaded: dict[str, Arrays] = {}  # tables of several meshes, which share them
-        items: dict[str, list[Batch]] = {split: [] for split in wanted}
-        progress = tqdm(
-            zip(names, shapes, tasks, strict=True),
-            total=len(names),
-            desc="Loading",
-            unit="mesh",
-            delay=1.0,
-        )
-        for (split, name), shape, (*descriptors, table) in progress:
-            arrays = loaded.get(table.key)
-            if arrays is None:
-                arrays = load_task(table, self.cache)
-                if repeated[table.key] > 1:
-                    loaded[table.key] = arrays
-            described = [load_task(task, self.cache) for task in descriptors]
-            for task, result in zip(descriptors, described, strict=True):
-                if undefined := int(result["undefined"]):
-                    log.warning(
-                        "%s: %s is undefined at %d of %d vertices; using zeros",
-                        name,
-                        task.kind.upper(),
-                        undefined,
-                        len(shape.labels),
-                    )
-            item = described_tensors(described, shape.mesh, self.features)
-            item |= neighbourhood_tensors(shape.mesh, self.neighbourhood, arrays, self.cache)
-            item["labels"] = torch.from_numpy(shape.labels)
-            if shape.points is not None:
-                points = shape.points._asdict()
-                item |= {key: torch.from_numpy(array) for key, array in points.items()}
-            items[split].append(item)
+        names = [name for split in wanted for name in self.shapes.names[split]]
+        prepared = self.recipe.prepare_all(names, self.workers)
+        repeated = Counter(each.table for each in prepared)
+        tables = {key: None for key, count in repeated.items() if count > 1}
+        rest = iter(prepared)
         for split in wanted:
-            self.datasets[split] = MeshDataset(self.shapes.names[split], items[split])
-
-    def _check_size(self, name: str, vertices: int) -> None:
-        least = self.neighbourhood.least_vertices
-        if least > vertices:
-            raise DataError(
-                f"{name}: {self.neighbourhood.noun} must have at most the {vertices:,} vertices of "
-                f"the mesh, got {least:,}"
-            )
+            of_split = list(islice(rest, len(self.shapes.names[split])))
+            self.datasets[split] = MeshDataset(self.recipe, of_split, tables)
 
     def train_dataloader(self) -> DataLoader:
         skip, self._skip = self._skip, 0
         rank, world = self._rank_and_world()
         sampler = EpochSampler(len(self.datasets["train"]), self.seed, skip, rank, world)
-        return DataLoader(self.datasets["train"], batch_size=None, sampler=sampler)
+        return self._loader("train", sampler)
 
     def val_dataloader(self) -> DataLoader:
         return self._in_order("val")
@@ -336,7 +220,18 @@ class CorrespondenceData(L.LightningDataModule):
             raise DataError(
                 f"the split {split} must have a mesh for each of {world} processes, got {size}"
             )
-        return DataLoader(self.datasets[split], batch_size=None, sampler=range(rank, size, world))
+        return self._loader(split, range(rank, size, world))
+
+    def _loader(self, split: str, sampler: Iterable[int]) -> DataLoader:
+        dataset = self.datasets[split]
+        readers = self.readers
+        if readers is None:
+            item = dataset[0]
+            size = sum(t.nbytes for t in tree_leaves(item) if isinstance(t, torch.Tensor))
+            readers = int(size * dataset.sizes.sum() / dataset.sizes[0] > KEPT)
+        # forked processes could hang in libraries that had started threads
+        ahead = {"multiprocessing_context": "spawn", "persistent_workers": True} if readers else {}
+        return DataLoader(dataset, batch_size=None, sampler=sampler, num_workers=readers, **ahead)
 
     def _rank_and_world(self) -> tuple[int, int]:
         trainer = self.trainer

@@ -1,18 +1,73 @@
-"""A pool of worker processes, by joblib's loky backend."""
+"""Work in a pool of worker processes, by joblib's loky backend."""
 
 from __future__ import annotations
 
 import os
+import random
 import threading
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import cache
 from typing import Any
 
-from joblib import Parallel, delayed
+from joblib import Parallel, cpu_count, delayed
 from joblib.externals.loky.process_executor import TerminatedWorkerError
+from tqdm import tqdm
 
 from meshspiral.data.shapes import DataError
+
+POOL_START = 6.0  # seconds that starting the worker processes takes
+LARGEST_JOB = 16  # items
+
+
+def run_all(
+    function: Callable[[Any], Any], items: Sequence[Any], workers: int | None, description: str
+) -> list[Any]:
+    """The results of a function for all items, with a progress bar.
+
+    The order of the calls is random and differs between processes, so that jobs of a sweep that
+    start together share the work. Worker processes are started only if the remaining work would
+    take longer than starting them.
+
+    Args:
+        function: Picklable.
+        items: Its arguments.
+        workers: Number of processes; None for one per core.
+        description: Label of the progress bar.
+
+    Raises:
+        DataError: A worker process was killed.
+    """
+    order = list(range(len(items)))
+    random.Random(os.getpid()).shuffle(order)
+    workers = min(workers or cpu_count(), len(items))
+    results: list[Any] = [None] * len(items)
+    with tqdm(total=len(items), desc=description, unit="mesh", delay=1.0) as progress:
+        started = None
+        for done, i in enumerate(order):
+            if workers > 1 and done > 1:
+                remaining = (time.perf_counter() - started) / (done - 1) * (len(items) - done)
+                if remaining > POOL_START:
+                    rest = order[done:]
+                    # few jobs of several items: the function may be large when it is pickled
+                    size = max(1, min(LARGEST_JOB, len(rest) // (8 * workers)))
+                    parts = [rest[k : k + size] for k in range(0, len(rest), size)]
+                    jobs = ((function, part, [items[k] for k in part]) for part in parts)
+                    for part, found in run_in_pool(_run_part, jobs, workers, "data.workers=1"):
+                        for k, result in zip(part, found, strict=True):
+                            results[k] = result
+                        progress.update(len(part))
+                    return results
+            results[i] = function(items[i])
+            progress.update()
+            started = started or time.perf_counter()  # after the first, which compiles
+    return results
+
+
+def _run_part(
+    function: Callable[[Any], Any], part: list[int], items: list[Any]
+) -> tuple[list[int], list[Any]]:
+    return part, [function(item) for item in items]
 
 
 def run_in_pool(

@@ -3,30 +3,23 @@
 from __future__ import annotations
 
 import inspect
-import os
-import random
 import sys
-import time
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from functools import partial
 from types import ModuleType
 
 import numpy as np
-from joblib import cpu_count
-from tqdm import tqdm
 
 from meshspiral.data.cache import Arrays, Cache, code_version
 from meshspiral.data.descriptors import Descriptor
-from meshspiral.data.pool import run_in_pool
+from meshspiral.data.pool import run_all
 from meshspiral.geometry import mesh as meshes
 from meshspiral.geometry import shot
 from meshspiral.geometry.digest import digest
 from meshspiral.geometry.mesh import Mesh, MeshError
 from meshspiral.geometry.shot import Frame
 from meshspiral.neighbourhoods import Neighbourhood
-
-POOL_START = 6.0  # seconds that starting the worker processes takes
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,28 +42,30 @@ def frame_task(mesh: Mesh, frame: Frame) -> Task:
     return Task("frames", key, _frames, (mesh, frame))
 
 
-def descriptor_task(mesh: Mesh, descriptor: Descriptor) -> Task:
+def descriptor_task(mesh: Mesh, descriptor: Descriptor, half: bool = False) -> Task:
     """A descriptor: `features` float32 [V, C], zeros where it is undefined, and `undefined`, the
-    number of such vertices."""
+    number of such vertices. With `half`, features are float16."""
     key = digest(
+        *(["float16"] if half else []),
         repr(sorted(descriptor.settings.model_dump().items())),
         mesh.vertices,
         mesh.faces,
-        code_version(*descriptor.modules, *_sources(descriptor), meshes, sys.modules[__name__]),
+        code_version(*descriptor.modules, *sources(descriptor), meshes, sys.modules[__name__]),
     )
-    return Task(descriptor.name, key, partial(_described, descriptor), _inputs(descriptor, mesh))
+    compute = partial(_described, descriptor, np.float16 if half else np.float32)
+    return Task(descriptor.name, key, compute, _inputs(descriptor, mesh))
 
 
 def neighbourhood_task(mesh: Mesh, neighbourhood: Neighbourhood) -> Task:
     """The arrays of a neighbourhood, see its `compute`."""
-    version = code_version(*neighbourhood.modules, *_sources(neighbourhood))
+    version = code_version(*neighbourhood.modules, *sources(neighbourhood))
     settings = sorted(neighbourhood.settings.model_dump().items())
     key = digest(repr(settings), *neighbourhood.mesh_key(mesh), version)
     inputs = _inputs(neighbourhood, mesh)
     return Task(neighbourhood.name, key, neighbourhood.compute, inputs)
 
 
-def _sources(described: Descriptor | Neighbourhood) -> list[ModuleType]:
+def sources(described: Descriptor | Neighbourhood) -> list[ModuleType]:
     """The modules of an object's class and of those that it derives from, without the base."""
     classes = [
         cls for cls in type(described).__mro__ if issubclass(cls, Descriptor | Neighbourhood)
@@ -91,12 +86,14 @@ def _frames(mesh: Mesh, frame: Frame) -> Arrays:
     return {"frames": shot.local_frames(mesh.centred, radius, masses)}
 
 
-def _described(descriptor: Descriptor, mesh: Mesh, *frames: np.ndarray) -> Arrays:
+def _described(
+    descriptor: Descriptor, dtype: type[np.floating], mesh: Mesh, *frames: np.ndarray
+) -> Arrays:
     _check_area(mesh)
     features = descriptor.compute(mesh, *frames)
     undefined = np.isnan(features).any(axis=1)
     features[undefined] = 0.0
-    return {"features": features, "undefined": np.array(undefined.sum())}
+    return {"features": features.astype(dtype, copy=False), "undefined": np.array(undefined.sum())}
 
 
 def _check_area(mesh: Mesh) -> None:
@@ -106,10 +103,6 @@ def _check_area(mesh: Mesh) -> None:
 
 def run_tasks(tasks: Iterable[Task], cache: Cache, workers: int | None, description: str) -> None:
     """Compute and cache what the cache lacks, with a progress bar.
-
-    The order is random and differs between processes, so that jobs of a sweep that start together
-    share the work. Worker processes are started only if the remaining work would take longer than
-    starting them.
 
     Args:
         tasks: Several tasks may have one key.
@@ -123,32 +116,18 @@ def run_tasks(tasks: Iterable[Task], cache: Cache, workers: int | None, descript
         MeshError: A mesh cannot be described.
     """
     missing = {task.key: task for task in tasks if not cache.has(task.kind, task.key)}
-    queue = list(missing.values())
-    random.Random(os.getpid()).shuffle(queue)
-    workers = min(workers or cpu_count(), len(queue))
-    with tqdm(total=len(queue), desc=description, delay=1.0) as progress:
-        started = None
-        for done, task in enumerate(queue):
-            if workers > 1 and done > 1:
-                remaining = (time.perf_counter() - started) / (done - 1) * (len(queue) - done)
-                if remaining > POOL_START:
-                    jobs = ((task, cache) for task in queue[done:])
-                    for _ in run_in_pool(_run, jobs, workers, "data.workers=1"):
-                        progress.update()
-                    return
-            _run(task, cache)
-            progress.update()
-            started = started or time.perf_counter()  # after the first task, which compiles
+    run_all(partial(ensure_task, cache=cache), list(missing.values()), workers, description)
 
 
-def _run(task: Task, cache: Cache) -> None:
+def ensure_task(task: Task, cache: Cache) -> None:
+    """Compute and cache a result that the cache lacks."""
     if not cache.has(task.kind, task.key):  # another process may have computed it meanwhile
         cache.save(task.kind, task.key, compute_task(task, cache))
 
 
-def load_task(task: Task, cache: Cache) -> Arrays:
+def load_task(task: Task, cache: Cache, check: bool = True) -> Arrays:
     """The result of a task: from the cache, or computed if it is missing or damaged there."""
-    return cache.get(task.kind, task.key, lambda: compute_task(task, cache))
+    return cache.get(task.kind, task.key, lambda: compute_task(task, cache), check)
 
 
 def compute_task(task: Task, cache: Cache | None = None) -> Arrays:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from importlib.metadata import PackageNotFoundError, version
 
 import numpy as np
@@ -75,6 +76,14 @@ class Remeshed(ShapeSet):
         labels = corners[np.arange(len(corners)), nearest]
         points = SurfacePoints(corners, arrays["weights"])
         return Shape(shape, labels, len(template), points)
+
+    def stamp(self, name: str) -> str | None:
+        original, copy = self._original(name)
+        stamp = self._base.stamp(original)
+        if stamp is None:
+            return None
+        code = code_version(remesh, meshes, sys.modules[__name__])
+        return f"{stamp}|{self._policy}|{self._vertices}|{copy}|{code}|{self._version}"
 
     def source(self, name: str) -> Shape:
         """The original of a remeshed shape.

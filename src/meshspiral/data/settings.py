@@ -60,6 +60,12 @@ class DataSettings(Strict):
     shot: ShotSettings
     shuffle_vertices: bool = Field(description="renumber the vertices of every mesh at random")
     cache_dir: Text = Field(description="folder of cached results")
+    half: bool = Field(description="keep descriptors as float16 in the cache: half the space")
+    readers: int | None = Field(
+        ge=0,
+        description="processes that read meshes ahead of the steps; null: one if the meshes do not "
+        "fit into half a gigabyte",
+    )
     workers: int | None = Field(
         ge=1, description="processes that compute descriptors and tables; null: one per core"
     )

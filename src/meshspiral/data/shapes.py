@@ -120,6 +120,14 @@ class ShapeSet(ABC):
     def prepare(self, names: list[str]) -> None:  # noqa: B027  (an optional hook)
         """Compute what `load` needs for these shapes, if anything."""
 
+    def stamp(self, name: str) -> str | None:
+        """What changes whenever the content of a shape may have changed, found without reading it.
+
+        With it, a start does not read meshes whose results are cached. None, the default: each is
+        read. Settings alone do not suffice where files can change; `file_stamp` helps.
+        """
+        return None
+
     @abstractmethod
     def load(self, name: str) -> Shape:
         """Load a shape.
@@ -131,6 +139,19 @@ class ShapeSet(ABC):
             DataError: There is no such shape, or its data are unusable.
             MeshError: Its mesh is unusable.
         """
+
+
+def file_stamp(*paths: Path | None) -> str:
+    """Names, sizes and times of files, for `ShapeSet.stamp`; a missing file has none."""
+    return "|".join(f"{path}:{_size_and_time(path)}" for path in paths if path)
+
+
+def _size_and_time(path: Path) -> str:
+    try:
+        status = path.stat()
+    except OSError:
+        return "missing"
+    return f"{status.st_size}:{status.st_mtime_ns}"
 
 
 def subject_split(names: list[str], per_subject: int = 10) -> dict[str, list[str]]:

@@ -39,4 +39,6 @@ def open_data(config: Any) -> CorrespondenceData:
         config.seed,
         data.shuffle_vertices,
         data.workers,
+        data.half,
+        data.readers,
     )

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -70,7 +70,11 @@ class Outcome:
 
     @classmethod
     def of(
-        cls, names: list[str], items: list[Batch], results: Mapping[int, Result], diameter: float
+        cls,
+        names: list[str],
+        items: Sequence[Batch],
+        results: Mapping[int, Result],
+        diameter: float,
     ) -> Outcome:
         """The outcome of the meshes that have a result.
 

@@ -135,7 +135,7 @@ def choose_shapes(shapes: int | list[str], names: list[str]) -> list[str]:
 
 def evaluate(predict: Predict, data: CorrespondenceData) -> Outcome:
     """Predict all test shapes as `train` does."""
-    names, items = data.shapes.names["test"], data.datasets["test"].items
+    names, items = data.shapes.names["test"], data.datasets["test"]
     progress = tqdm(range(len(items)), desc="Test", unit="mesh", leave=False, delay=1.0)
     results = {i: predict_mesh(predict, data, i, "evaluation") for i in progress}
     return Outcome.of(names, items, results, data.reference.diameter)
@@ -143,7 +143,7 @@ def evaluate(predict: Predict, data: CorrespondenceData) -> Outcome:
 
 def evaluate_rotations(predict: Predict, data: CorrespondenceData, count: int) -> Rotations:
     """Predict all test shapes `count` times, each time with other random neighbourhoods."""
-    items = data.datasets["test"].items
+    items = data.datasets["test"]
     progress = tqdm(range(count), desc="Rotations", unit="run")
     runs = (
         [predict_mesh(predict, data, i, f"rotation {r}") for i in range(len(items))]

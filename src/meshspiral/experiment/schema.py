@@ -350,6 +350,8 @@ def upgraded(values: dict[str, Any]) -> dict[str, Any]:
         for key, value in STARTED.items():
             values["neighbourhood"].setdefault(key, value)
     data.setdefault("shuffle_vertices", False)
+    data.setdefault("half", False)
+    data.setdefault("readers", None)
     if isinstance(values.get("optim"), dict):
         values["optim"].setdefault("soft_labels", None)
     values.setdefault("plugins", [])

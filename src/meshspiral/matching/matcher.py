@@ -17,10 +17,10 @@ import torch
 from scipy.sparse import csr_array
 from scipy.spatial import cKDTree
 
-from meshspiral.data.datamodule import described_tensors, neighbourhood_tensors
 from meshspiral.data.descriptors import Features
 from meshspiral.data.preprocessing import compute_task, descriptor_task, neighbourhood_task
 from meshspiral.data.scans import Scan
+from meshspiral.data.tensors import described_tensors, neighbourhood_tensors
 from meshspiral.experiment.run_folder import BEST
 from meshspiral.experiment.schema import TrainConfig
 from meshspiral.geometry.barycentric import interpolate

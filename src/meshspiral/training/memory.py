@@ -7,7 +7,6 @@ that the estimate needs to know nothing of networks and neighbourhoods.
 from __future__ import annotations
 
 import copy
-import itertools
 import logging
 import weakref
 from collections.abc import Iterable, Iterator
@@ -21,13 +20,9 @@ from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves
 
-from meshspiral.data.datamodule import (
-    CorrespondenceData,
-    described_tensors,
-    draw,
-    neighbourhood_tensors,
-)
+from meshspiral.data.datamodule import CorrespondenceData
 from meshspiral.data.preprocessing import compute_task, neighbourhood_task
+from meshspiral.data.tensors import described_tensors, draw, neighbourhood_tensors
 from meshspiral.geometry.mesh import Mesh
 from meshspiral.neighbourhoods.base import Batch
 from meshspiral.nn.loss import ROWS, linear_cross_entropy
@@ -62,7 +57,8 @@ def estimate_memory(net: Network, data: CorrespondenceData, precision: str) -> E
     Returns:
         The estimate; None if no pass on a small mesh succeeds.
     """
-    largest = max(data.datasets["train"].items, key=lambda item: len(item["labels"]))
+    train = data.datasets["train"]
+    largest = train[int(train.sizes.argmax())]
     vertices = len(largest["labels"])
     net = copy.deepcopy(net).train()
     if precision == "64-true":
@@ -236,8 +232,7 @@ def _table_bytes(batch: Batch) -> int:
 
 
 def _loaded_bytes(data: CorrespondenceData) -> int:
-    items = itertools.chain(*(dataset.items for dataset in data.datasets.values()))
-    return sum(_tensor_bytes(items).values())
+    return sum(dataset.kept for dataset in data.datasets.values())
 
 
 # ----------------------------------------------------------------------------------- this machine

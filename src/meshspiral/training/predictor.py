@@ -7,7 +7,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from meshspiral.data.datamodule import draw
+from meshspiral.data.tensors import draw
 from meshspiral.experiment.run_folder import RunError
 from meshspiral.experiment.schema import TrainConfig
 from meshspiral.neighbourhoods import Neighbourhood

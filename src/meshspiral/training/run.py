@@ -88,7 +88,7 @@ def train(config: TrainConfig, folder: Path) -> dict[str, float]:
         trainer.logger.finalize("success")
         outcome = Outcome.of(
             data.shapes.names["test"],
-            data.datasets["test"].items,
+            data.datasets["test"],
             module.results["test"],
             data.reference.diameter,
         )

@@ -9,7 +9,14 @@ import numpy as np
 from pydantic import Field
 
 from meshspiral.data.settings import DataSettings
-from meshspiral.data.shapes import DataError, Shape, ShapeSet, registered_shape, subject_split
+from meshspiral.data.shapes import (
+    DataError,
+    Shape,
+    ShapeSet,
+    file_stamp,
+    registered_shape,
+    subject_split,
+)
 from meshspiral.geometry.mesh import Mesh
 
 Size = Literal[1500, 6890]
@@ -37,8 +44,8 @@ class Bodies(ShapeSet, name="bodies"):
     def __init__(self, vertices: int = 1500) -> None:
         if vertices not in get_args(Size):
             raise DataError(f"vertices must be 1500 or 6890, got {vertices!r}")
-        path = Path(__file__).parents[1] / "assets" / f"bodies_{int(vertices)}.npz"
-        with np.load(path, allow_pickle=False) as file:
+        self._file = Path(__file__).parents[1] / "assets" / f"bodies_{int(vertices)}.npz"
+        with np.load(self._file, allow_pickle=False) as file:
             arrays = dict(file)
         self._offset, self._scale = arrays["offset"], arrays["scale"]
         self._faces = arrays["faces"]
@@ -50,6 +57,9 @@ class Bodies(ShapeSet, name="bodies"):
         if name not in self._grid:
             raise DataError(f"no body is named {name!r}; the first is {next(iter(self._grid))!r}")
         return registered_shape(self._mesh(name, self._grid[name]), self.template)
+
+    def stamp(self, name: str) -> str:
+        return file_stamp(self._file)
 
     def _mesh(self, name: str, grid: np.ndarray) -> Mesh:
         """The mesh of quantised coordinates.

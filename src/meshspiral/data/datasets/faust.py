@@ -13,7 +13,14 @@ from pydantic import Field
 
 from meshspiral.data.mesh_files import parse_mesh, read_mesh
 from meshspiral.data.settings import DataSettings, Text
-from meshspiral.data.shapes import DataError, Shape, ShapeSet, registered_shape, subject_split
+from meshspiral.data.shapes import (
+    DataError,
+    Shape,
+    ShapeSet,
+    file_stamp,
+    registered_shape,
+    subject_split,
+)
 from meshspiral.geometry.mesh import Mesh
 
 NAMES = [f"tr_reg_{i:03d}" for i in range(100)]
@@ -67,6 +74,10 @@ class Faust(ShapeSet, name="faust"):
         if name not in NAMES:
             raise DataError(f"name must be one of {NAMES[0]} .. {NAMES[-1]}, got {name!r}")
         return registered_shape(self._read(name), self.template)
+
+    def stamp(self, name: str) -> str:
+        root = self._root
+        return file_stamp(root / self._files[name] if root.is_dir() else root)
 
     def _read(self, name: str) -> Mesh:
         file = self._files[name]

@@ -14,7 +14,7 @@ from meshspiral.data.datasets.faust import Faust
 from meshspiral.data.datasets.folder import find_meshes
 from meshspiral.data.mesh_files import read_mesh
 from meshspiral.data.settings import DataSettings, Text
-from meshspiral.data.shapes import DataError, Shape, ShapeSet, read_labels
+from meshspiral.data.shapes import DataError, Shape, ShapeSet, file_stamp, read_labels
 from meshspiral.geometry.mesh import Mesh
 
 log = logging.getLogger(__name__)
@@ -113,6 +113,11 @@ class FaustBenchmark(ShapeSet, name="faust_benchmark"):
         mesh = read_mesh(self._files[name])
         labels = read_labels(self._files[name].with_suffix(".txt"), len(mesh.vertices))
         return Shape(mesh, labels, len(self.template.vertices))
+
+    def stamp(self, name: str) -> str:
+        if name not in self._files:
+            return self._faust.stamp(name)
+        return file_stamp(self._files[name], self._files[name].with_suffix(".txt"))
 
 
 def _data_folder(benchmark_root: str | Path | None, policy: str) -> Path:

@@ -11,7 +11,15 @@ from pydantic import BeforeValidator, Field
 
 from meshspiral.data.mesh_files import SUFFIXES, read_mesh
 from meshspiral.data.settings import DataSettings, Text
-from meshspiral.data.shapes import SPLITS, DataError, Shape, ShapeSet, read_labels, registered_shape
+from meshspiral.data.shapes import (
+    SPLITS,
+    DataError,
+    Shape,
+    ShapeSet,
+    file_stamp,
+    read_labels,
+    registered_shape,
+)
 from meshspiral.geometry.mesh import Mesh
 
 
@@ -111,6 +119,9 @@ class Folder(ShapeSet, name="folder"):
             return registered_shape(mesh, self.template)
         read = read_labels(labels, len(mesh.vertices))
         return Shape(mesh, read, len(self.template.vertices))
+
+    def stamp(self, name: str) -> str:
+        return file_stamp(self._meshes[name], self._labels[name])
 
 
 def find_meshes(root: Path, entries: str | Sequence[str] | None) -> list[Path]:

@@ -102,4 +102,10 @@ def settings_with_descriptors(settings: type[DataSettings]) -> type[DataSettings
         if name not in DataSettings.model_fields and descriptor.Settings.model_fields:
             required = any(f.is_required() for f in descriptor.Settings.model_fields.values())
             fields[name] = (descriptor.Settings, ... if required else descriptor.Settings())
-    return create_model(settings.__name__, __base__=settings, **fields)
+    made = create_model(settings.__name__, __base__=settings, **fields)
+    made.__reduce__ = lambda self: (_read_settings, (settings, self.model_dump()))
+    return made
+
+
+def _read_settings(settings: type[DataSettings], values: dict[str, Any]) -> DataSettings:
+    return settings_with_descriptors(settings).model_validate(values)
