@@ -12,6 +12,7 @@ COMMANDS = {
     "match": "match meshes",
     "report": "show many runs on one page",
     "meshes": "list the meshes of a data set",
+    "preprocess": "fill the cache for a data set",
     "draw": "draw the neighbourhoods of a vertex",
     "benchmark": "measure what a training step costs",
     "doctor": "print what a bug report needs",

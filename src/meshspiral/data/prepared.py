@@ -98,7 +98,7 @@ class Recipe:
             CacheError: The cache cannot be written.
         """
         manifest = self._manifest(names)
-        found = read_manifest(manifest) if manifest else None
+        found = read_manifest(manifest, names) if manifest else None
         if found is None:
             noun = f"Descriptors and {self.neighbourhood.noun}"
             found = run_all(self.prepare, names, workers, noun)
@@ -205,9 +205,10 @@ class Recipe:
         return self.cache.root / "manifests" / f"{key}.json"
 
 
-def read_manifest(path: Path) -> list[Prepared] | None:
-    """The content of a manifest; None if it is missing or damaged."""
+def read_manifest(path: Path, names: Sequence[str]) -> list[Prepared] | None:
+    """The content of a manifest of these shapes; None if it is missing or damaged."""
     try:
-        return [Prepared(**fields) for fields in json.loads(path.read_text())]
+        found = [Prepared(**fields) for fields in json.loads(path.read_text())]
     except (OSError, ValueError, TypeError):
         return None
+    return found if [each.name for each in found] == list(names) else None

@@ -219,6 +219,20 @@ class MeshesConfig(Settings):
     plugins: Plugins
 
 
+class PreprocessConfig(Settings):
+    """Settings of `preprocess`."""
+
+    data: SerializeAsAny[DataSettings]
+    neighbourhood: SerializeAsAny[BaseModel]
+    seq_len: int = Field(ge=1, description="number of vertices N of a spiral")
+    seed: int = Field(ge=0, lt=2**32, description="seed of the run, for data.shuffle_vertices")
+    scheduler: Text | None = Field(
+        description="address of a Dask scheduler whose workers compute, tcp://host:port; null: "
+        "processes on this machine"
+    )
+    plugins: Plugins
+
+
 class DrawConfig(Settings):
     """Settings of `draw`."""
 
