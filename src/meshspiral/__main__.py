@@ -13,6 +13,7 @@ COMMANDS = {
     "report": "show many runs on one page",
     "meshes": "list the meshes of a data set",
     "preprocess": "fill the cache for a data set",
+    "cache": "show and bound the cache",
     "draw": "draw the neighbourhoods of a vertex",
     "benchmark": "measure what a training step costs",
     "doctor": "print what a bug report needs",

@@ -26,9 +26,7 @@ def arguments(toy_overrides, tmp_path):
     return [*data, f"data.cache_dir={tmp_path / 'cache'}"]
 
 
-def test_training_after_it_reads_no_mesh_but_that_of_a_picture(
-    cli, arguments, toy_overrides, tmp_path, monkeypatch
-):
+def test_training_after_it_reads_no_mesh(cli, arguments, toy_overrides, tmp_path, monkeypatch):
     code, out, err = cli(*arguments, program=preprocess.main)
     assert code == 0, err
     assert re.search(r"12 meshes prepared in \d+\.\d s; cache .*: \d+ MB", out)

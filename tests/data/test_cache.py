@@ -34,7 +34,8 @@ def test_saved_arrays_are_loaded_and_no_other_file_is_left(cache):
     cache.save("kind", "key", ARRAYS)
     assert same(cache.load("kind", "key"))
     assert [p.name for p in cache.root.rglob("*") if p.is_file()] == ["key.safetensors"]
-    assert cache.size() == cache.path("kind", "key").stat().st_size
+    [entry] = cache.entries()
+    assert entry[:2] == (cache.path("kind", "key"), cache.path("kind", "key").stat().st_size)
 
 
 @pytest.mark.skipif(os.name == "nt", reason="Windows has no file modes")
@@ -245,3 +246,17 @@ def test_results_that_another_process_saved_meanwhile_are_not_computed_again(tmp
 
     run_tasks([Task("toys", key, compute, (key,)) for key in "abc"], cache, 1, "Preparing")
     assert len(done) == 1
+
+
+def test_what_was_read_last_stays(cache):
+    now = time.time()
+    for days, name in enumerate("abcd"):
+        cache.save("kind", name, {"x": np.zeros(100)})
+        os.utime(cache.path("kind", name), (now, now - days * 86400 - 60))
+    one = cache.entries()[0].size
+    assert cache.prune(None, None) == []
+    cache.load("kind", "d", check=False)  # now it is the newest
+    assert [e.path.stem for e in cache.prune(None, now - 2 * 86400)] == ["c"]
+    assert [e.path.stem for e in cache.prune(2.5 * one, None)] == ["b"]
+    assert {e.path.stem for e in cache.entries()} == {"a", "d"}
+    assert [e.path.stem for e in cache.prune(0, None)] == ["d", "a"]

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import contextlib
 import inspect
 import logging
+import os
 import zlib
 from collections.abc import Callable
 from functools import cache
 from pathlib import Path
 from types import ModuleType
+from typing import NamedTuple
 
 import numpy as np
 from safetensors import SafetensorError, safe_open
@@ -30,6 +33,14 @@ class CacheError(OSError):
 def code_version(*modules: ModuleType) -> str:
     """A hash of the modules' source code, so that a change of code invalidates its results."""
     return digest(*(inspect.getsource(module) for module in modules))
+
+
+class Entry(NamedTuple):
+    """A file of a cache: its path, its size in bytes, and when it was last read, since 1970."""
+
+    path: Path
+    size: int
+    read: float
 
 
 class Cache:
@@ -82,6 +93,8 @@ class Cache:
         if check and about.get("crc32") != _checksum(arrays):
             log.warning("%s is damaged (wrong checksum); computing it again", path)
             return None
+        with contextlib.suppress(OSError):  # in a folder of somebody else
+            os.utime(path)
         return arrays
 
     def save(self, kind: str, key: str, arrays: Arrays) -> None:
@@ -128,15 +141,35 @@ class Cache:
             self.save(kind, key, arrays)
         return arrays
 
-    def size(self) -> int:
-        """Total size of all results in bytes."""
-        total = 0
-        for path in self.root.rglob(f"*{SUFFIX}"):
-            try:
-                total += path.stat().st_size
-            except OSError:  # another process is replacing it
-                continue
-        return total
+    def entries(self) -> list[Entry]:
+        """All files of the cache."""
+        found = []
+        for path in self.root.glob("*/*"):
+            if path.suffix in (SUFFIX, ".json"):
+                with contextlib.suppress(OSError):  # another process is replacing it
+                    status = path.stat()
+                    found.append(Entry(path, status.st_size, status.st_mtime))
+        return found
+
+    def prune(self, most: float | None, since: float | None) -> list[Entry]:
+        """Remove the files whose last reading is longest ago.
+
+        Args:
+            most: Bytes that may stay; None for any number.
+            since: Remove what was last read before this time, in seconds since 1970; None for no
+                such time.
+
+        Returns:
+            What was removed.
+        """
+        removed, size = [], 0
+        for entry in sorted(self.entries(), key=lambda entry: -entry.read):
+            size += entry.size
+            if (most is not None and size > most) or (since is not None and entry.read < since):
+                with contextlib.suppress(FileNotFoundError):
+                    entry.path.unlink()
+                removed.append(entry)
+        return removed
 
 
 def _checksum(arrays: Arrays) -> str:

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import inspect
 import json
 import logging
+import os
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -211,4 +213,8 @@ def read_manifest(path: Path, names: Sequence[str]) -> list[Prepared] | None:
         found = [Prepared(**fields) for fields in json.loads(path.read_text())]
     except (OSError, ValueError, TypeError):
         return None
-    return found if [each.name for each in found] == list(names) else None
+    if [each.name for each in found] != list(names):
+        return None
+    with contextlib.suppress(OSError):
+        os.utime(path)  # it was read now
+    return found

@@ -14,6 +14,7 @@ from meshspiral.experiment.program import command_line
 from meshspiral.experiment.schema import (
     GROUPS,
     BenchmarkConfig,
+    CacheConfig,
     DoctorConfig,
     DrawConfig,
     EvaluateConfig,
@@ -33,6 +34,7 @@ COMMANDS = {
     "match": MatchConfig,
     "meshes": MeshesConfig,
     "preprocess": PreprocessConfig,
+    "cache": CacheConfig,
     "draw": DrawConfig,
     "report": ReportConfig,
     "benchmark": BenchmarkConfig,

@@ -233,6 +233,19 @@ class PreprocessConfig(Settings):
     plugins: Plugins
 
 
+class CacheConfig(Settings):
+    """Settings of `cache`."""
+
+    cache_dir: Text = Field(description="the folder of cached results")
+    unused_days: float | None = Field(
+        ge=0, description="remove results that have not been read for so many days"
+    )
+    max_gb: float | None = Field(
+        ge=0,
+        description="remove the results whose last reading is longest ago, until the rest fits",
+    )
+
+
 class DrawConfig(Settings):
     """Settings of `draw`."""
 

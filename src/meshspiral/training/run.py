@@ -127,5 +127,4 @@ def description_lines(
         f"{epochs} epoch{'s' * (epochs > 1)}, {precision} on {config.trainer.accelerator}, "
         f"{threads} thread{'s' * (threads > 1)}"
     )
-    megabytes = data.cache.size() / 1e6
-    yield f"cache: {data.cache.root}, {megabytes:.0f} MB; ready after {seconds:.1f} s"
+    yield f"cache: {data.cache.root}; ready after {seconds:.1f} s"
