@@ -21,6 +21,7 @@ __all__ = ["METRICS", "QUICK", "ROOT", "STARTED", "composed"]
 
 ROOT = Path(CONF).parent
 QUICK = ["optim.epochs=1"]
+SECONDS = {"seconds/preprocess", "seconds/train", "seconds/wait"}
 METRICS = {
     "test/exact_match",
     "test/geodesic_error",
@@ -29,8 +30,7 @@ METRICS = {
     "test/within_0.05",
     "test/within_0.10",
     "parameters",
-    "seconds/preprocess",
-    "seconds/train",
+    *SECONDS,
 }
 # a process that ends as VTK's does without OpenGL, by a segmentation fault
 VTK_CRASHES = [sys.executable, "-c", "import os; os._exit(139)"]

@@ -232,7 +232,7 @@ def test_two_processes_give_the_metrics_of_one(toy_overrides, tmp_path):
         del saved["processes"]
         torch.save(saved, path)
     alone = run(tmp_path / "job", [*toy_overrides, "optim.epochs=2"])  # with the same weights
-    for name in sorted(helpers.METRICS - {"seconds/preprocess", "seconds/train"}):
+    for name in sorted(helpers.METRICS - helpers.SECONDS):
         assert together[name] == pytest.approx(alone[name], rel=1e-5), name
 
 

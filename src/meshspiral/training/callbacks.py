@@ -115,10 +115,12 @@ class Speed(Callback):
 
     Attributes:
         seconds: Training time so far with validation, summed over all parts of a resumed run.
+        waiting: The part of it between two steps of an epoch: reading a mesh, and drawing its
+            neighbourhoods.
     """
 
     def __init__(self) -> None:
-        self._earlier = 0.0
+        self._earlier = self.waiting = 0.0
         self._began: float | None = None
 
     @property
@@ -128,28 +130,32 @@ class Speed(Callback):
     def on_train_start(self, trainer: L.Trainer, module: L.LightningModule) -> None:
         self._began = time.perf_counter()
         self._steps, self._busy = 0, 0.0
+        self._ended: float | None = None
 
     def on_train_end(self, trainer: L.Trainer, module: L.LightningModule) -> None:
         self._earlier, self._began = self.seconds, None
 
     def on_train_batch_start(self, trainer, module, batch, batch_idx) -> None:
         self._started = time.perf_counter()
+        if self._ended is not None:
+            self.waiting += self._started - self._ended
 
     def on_train_batch_end(self, trainer, module, outputs, batch, batch_idx) -> None:
         self._steps += 1
-        self._busy += time.perf_counter() - self._started
+        self._ended = time.perf_counter()
+        self._busy += self._ended - self._started
 
     def on_train_epoch_end(self, trainer: L.Trainer, module: L.LightningModule) -> None:
         if self._busy > 0:
             speed = self._steps / self._busy
             module.log("train/steps_per_second", speed, batch_size=1, sync_dist=True)
-        self._steps, self._busy = 0, 0.0
+        self._steps, self._busy, self._ended = 0, 0.0, None
 
     def state_dict(self) -> dict[str, float]:
-        return {"seconds": self.seconds}
+        return {"seconds": self.seconds, "waiting": self.waiting}
 
     def load_state_dict(self, state: dict[str, float]) -> None:
-        self._earlier = state["seconds"]
+        self._earlier, self.waiting = state["seconds"], state.get("waiting", 0.0)
 
 
 class Looks(Callback):

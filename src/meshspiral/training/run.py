@@ -82,6 +82,7 @@ def train(config: TrainConfig, folder: Path) -> dict[str, float]:
         "parameters": parameters,
         "seconds/preprocess": seconds,
         "seconds/train": speed.seconds,
+        "seconds/wait": speed.waiting,
     }
     if trainer.is_global_zero:
         trainer.logger.log_hyperparams(flat(config.model_dump()), tested)
@@ -98,7 +99,12 @@ def train(config: TrainConfig, folder: Path) -> dict[str, float]:
         write_metrics(folder, metrics)  # the last file: now the run is finished
         for line in summary.metric_lines(outcome, metrics):
             log.info(line)
-        log.info("Seconds:     %.1f preprocessing, %.1f training", seconds, speed.seconds)
+        log.info(
+            "Seconds:     %.1f preprocessing, %.1f training, of it %.1f waiting for meshes",
+            seconds,
+            speed.seconds,
+            speed.waiting,
+        )
         log.info("Run folder:  %s", folder)
         log.info("TensorBoard: tensorboard --logdir %s", folder)
     return metrics
