@@ -264,6 +264,33 @@ def test_a_stopped_run_resumes_to_the_same_weights(
     assert metrics["seconds/train"] >= saved["callbacks"]["Speed"]["seconds"]
 
 
+@pytest.mark.parametrize("done", [2, 4, 5, 6, 9])
+def test_a_stopped_run_with_several_meshes_a_step_resumes_to_the_same_weights(
+    toy_overrides, tmp_path, monkeypatch, done
+):
+    """Stopped after some meshes; a step of four and a step of two make an epoch."""
+    overrides = [*toy_overrides, "trainer.accumulate=4", "optim.epochs=3"]
+    run(tmp_path / "whole", overrides)
+    original, served = Speed.on_train_batch_end, []
+
+    def stop(self, trainer, *args):
+        original(self, trainer, *args)
+        served.append(trainer.global_step)
+        if len(served) == done:
+            os.kill(os.getpid(), signal.SIGINT)
+
+    monkeypatch.setattr(Speed, "on_train_batch_end", stop)
+    with pytest.raises(Stopped):
+        run(tmp_path / "part", overrides)
+    assert len(served) == {2: 4, 4: 4, 5: 6, 6: 6, 9: 10}[done]  # the end of a step
+    monkeypatch.setattr(Speed, "on_train_batch_end", original)
+    with pytest.raises(RunError, match="of a run with trainer.accumulate=4, not 1"):
+        run(tmp_path / "part", [*toy_overrides, "optim.epochs=3"])
+    run(tmp_path / "part", overrides)
+    assert torch.load(tmp_path / "part" / LAST, weights_only=True)["global_step"] == 6
+    assert same_weights(tmp_path / "whole", tmp_path / "part")
+
+
 def test_a_killed_run_resumes_to_the_same_weights(toy_overrides, tmp_path):
     """A separate process, killed with SIGKILL; resumed with resume=<run folder>."""
     overrides = [*toy_overrides, "optim.epochs=12"]

@@ -236,6 +236,26 @@ def test_two_processes_give_the_metrics_of_one(toy_overrides, tmp_path):
         assert together[name] == pytest.approx(alone[name], rel=1e-5), name
 
 
+@pytest.mark.parametrize("processes", [2, 4])
+def test_several_processes_train_as_one_with_accumulation(toy_overrides, tmp_path, processes):
+    """Meshes, neighbourhoods and steps are the same; dropout would differ."""
+    exact = ["trainer.precision=64", "model.dropout=0", "optim.epochs=2", "picture=false"]
+    split = ["data.train=[train/0.ply,train/1.ply,train/2.ply,train/3.ply]"]
+    split += ["data.val=[val/*.ply,train/4.ply]", "data.test=[test/*.ply,train/5.ply]"]
+    toy = [*toy_overrides, *split, *exact]
+    ddp = ["trainer=ddp", "trainer.accelerator=cpu", f"trainer.devices={processes}"]
+    together, alone = tmp_path / "together", tmp_path / "alone"
+    command = [sys.executable, "-m", "src.train", *ddp, *toy, f"hydra.run.dir={together}"]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stdout + done.stderr
+    run(alone, [*toy, f"trainer.accumulate={processes}"])
+    one, other = (
+        torch.load(folder / LAST, weights_only=True)["state_dict"] for folder in (together, alone)
+    )
+    for name, value in one.items():
+        torch.testing.assert_close(value, other[name], rtol=0, atol=1e-7)
+
+
 def test_a_signal_to_one_process_of_several_stops_all(toy_overrides, tmp_path):
     ddp = ["trainer=ddp", "trainer.accelerator=cpu", "trainer.devices=2"]
     process = program_process([*toy_overrides, *ddp, "optim.epochs=500"], tmp_path)

@@ -30,9 +30,8 @@ def main(config: CacheConfig) -> None:
     most = None if config.max_gb is None else config.max_gb * 1e9
     since = None if config.unused_days is None else now - config.unused_days * DAY
     removed = cache.prune(most, since)
-    left = sum(entry.size for entry in cache.entries())
     size = sum(entry.size for entry in removed)
-    log.info("removed %d files, %.1f MB; %.1f MB are left", len(removed), size / 1e6, left / 1e6)
+    log.info("removed %d files, %.1f MB; %.1f MB are left", len(removed), size / 1e6, cache.size() / 1e6)
 
 
 def _table(entries: Sequence, now: float) -> list[str]:

@@ -23,7 +23,7 @@ def main(config: PreprocessConfig) -> None:
         data.prepare(splits)
     seconds = time.perf_counter() - began
     meshes = sum(len(data.datasets[split]) for split in splits)
-    size = sum(entry.size for entry in data.cache.entries()) / 1e6
+    size = data.cache.size() / 1e6
     log.info(
         "%d meshes prepared in %.1f s; cache %s: %.0f MB", meshes, seconds, data.cache.root, size
     )

@@ -151,6 +151,10 @@ class Cache:
                     found.append(Entry(path, status.st_size, status.st_mtime))
         return found
 
+    def size(self) -> int:
+        """Total size of all files in bytes."""
+        return sum(entry.size for entry in self.entries())
+
     def prune(self, most: float | None, since: float | None) -> list[Entry]:
         """Remove the files whose last reading is longest ago.
 

@@ -88,6 +88,7 @@ class TrainerSettings(Settings):
         BeforeValidator(lambda value: str(value) if isinstance(value, int) else value),
     ] = Field(description="32, 64, bf16, or auto: bf16 where the hardware has it, else 32")
     threads: Threads
+    accumulate: int = Field(ge=1, description="meshes of a step, in each process")
     val_every: int = Field(ge=1, description="epochs from one validation to the next")
 
 
@@ -381,6 +382,8 @@ def upgraded(values: dict[str, Any]) -> dict[str, Any]:
     data.setdefault("readers", None)
     if isinstance(values.get("optim"), dict):
         values["optim"].setdefault("soft_labels", None)
+    if isinstance(values.get("trainer"), dict):
+        values["trainer"].setdefault("accumulate", 1)
     values.setdefault("plugins", [])
     values.setdefault("picture", True)
     values.setdefault("init", None)

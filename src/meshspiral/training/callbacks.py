@@ -44,10 +44,10 @@ class Bar(ProgressBar):
         every = 0.1 if sys.stderr.isatty() else 10.0
         self._bar = tqdm(
             total=total,
-            initial=trainer.global_step,
+            initial=trainer.fit_loop.epoch_loop.total_batch_idx + 1,
             desc=self._epoch(trainer),
             bar_format=BAR_FORMAT,
-            unit="step",
+            unit="step" if trainer.accumulate_grad_batches == 1 else "mesh",
             mininterval=every,
             disable=not trainer.is_global_zero,
             dynamic_ncols=True,
@@ -220,6 +220,8 @@ class OrderlyStop(Callback):
     def on_train_batch_start(self, trainer, module, batch, batch_idx) -> None:
         # Never before the last step of an epoch: a checkpoint from there looks to Lightning like
         # one of a finished epoch. The start of an epoch is in last.ckpt already.
+        if batch_idx % trainer.accumulate_grad_batches:  # gradients of part of a step are not saved
+            return
         signum = self._heard(trainer)
         if signum is None or 0 < batch_idx == trainer.num_training_batches - 1:
             return

@@ -44,6 +44,12 @@ def check_checkpoint(checkpoint: Path, config: TrainConfig, processes: int) -> d
             f"{checkpoint} is of a run in {saved['processes']} processes, not {processes}: resume "
             "it with the same trainer.devices"
         )
+    accumulate = config_of(saved, str(checkpoint)).trainer.accumulate
+    if accumulate != config.trainer.accumulate:
+        raise RunError(
+            f"{checkpoint} is of a run with trainer.accumulate={accumulate}, not "
+            f"{config.trainer.accumulate}: resume it with the same"
+        )
     begun = saved["epoch"] + 1
     if config.optim.epochs < begun:
         raise RunError(

@@ -44,6 +44,7 @@ def build_trainer(config: TrainConfig, folder: Path, *callbacks: Callback) -> L.
             precision=choose_precision(asked.precision, accelerator),
             max_epochs=config.optim.epochs,
             check_val_every_n_epoch=asked.val_every,
+            accumulate_grad_batches=asked.accumulate,
             deterministic=accelerator == "cpu",
             logger=TensorBoardLogger(folder, name="", version="", default_hp_metric=False),
             log_every_n_steps=10,
