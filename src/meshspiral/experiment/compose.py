@@ -33,7 +33,7 @@ def known_keys(command: str) -> list[str]:
     """What can stand before = on the command line of a command: settings and config groups."""
     with _fresh_hydra():
         tree = OmegaConf.to_container(compose(command))
-    groups = {"experiment"} if command == "train" else set()
+    groups = {"experiment", "variant"} if command == "train" else set()
     return sorted({*flat(tree), *tree, *groups})
 
 
