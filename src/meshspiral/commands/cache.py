@@ -31,7 +31,9 @@ def main(config: CacheConfig) -> None:
     since = None if config.unused_days is None else now - config.unused_days * DAY
     removed = cache.prune(most, since)
     size = sum(entry.size for entry in removed)
-    log.info("removed %d files, %.1f MB; %.1f MB are left", len(removed), size / 1e6, cache.size() / 1e6)
+    log.info(
+        "removed %d files, %.1f MB; %.1f MB are left", len(removed), size / 1e6, cache.size() / 1e6
+    )
 
 
 def _table(entries: Sequence, now: float) -> list[str]:
