@@ -42,6 +42,16 @@ def test_limits_remove_what_is_unused(cli, cache, limit, left):
     assert len(cache.entries()) == left and cache.has("shot", "a")
 
 
+def test_damaged_files_are_removed(cli, cache):
+    path = cache.path("spiral", "a")
+    content = bytearray(path.read_bytes())
+    content[-1] ^= 1
+    path.write_bytes(content)
+    code, out, err = cli(f"cache_dir={cache.root}", "verify=true", program=main)
+    assert code == 0 and "1 damaged files removed" in out and "wrong checksum" in out + err
+    assert not path.exists() and len(cache.entries()) == 2
+
+
 @pytest.mark.parametrize(
     "word, message",
     [

@@ -10,7 +10,7 @@ from tests.helpers import VTK_CRASHES
 
 def test_versions_devices_and_space_are_printed(cli, tmp_path):
     (tmp_path / "cache/shot").mkdir(parents=True)
-    (tmp_path / "cache/shot/a.npz").write_bytes(bytes(3_000_000))
+    (tmp_path / "cache/shot/a.safetensors").write_bytes(bytes(3_000_000))
     code, out, err = cli("cache_dir=cache", program=doctor.main)
     assert code == 0, err
     rows = dict(line.split(maxsplit=1) for line in out.splitlines())

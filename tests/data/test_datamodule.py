@@ -11,7 +11,8 @@ import torch
 
 from meshspiral.data import pool, preprocessing
 from meshspiral.data.cache import Cache
-from meshspiral.data.datamodule import CorrespondenceData, EpochSampler
+from meshspiral.data.datamodule import CorrespondenceData
+from meshspiral.data.dataset import EpochSampler
 from meshspiral.data.descriptors import Features
 from meshspiral.data.descriptors.raw import Raw
 from meshspiral.data.descriptors.shot import Shot

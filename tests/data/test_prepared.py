@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from meshspiral.data import datamodule
+from meshspiral.data import dataset
 from meshspiral.data.datasets.folder import Folder
 from meshspiral.data.sources import open_data
 from meshspiral.geometry.mesh import Mesh
@@ -99,7 +99,7 @@ def test_items_are_kept_up_to_a_number_of_bytes(config, monkeypatch):
     train = opened(config()).datasets["train"]
     first = train[0]
     assert train[0]["features"] is first["features"] and train.kept > first["features"].nbytes
-    monkeypatch.setattr(datamodule, "KEPT", int(1.5 * train.kept))
+    monkeypatch.setattr(dataset, "KEPT", int(1.5 * train.kept))
     second = opened(config()).datasets["train"]
     for _ in range(2):
         items = list(second)

@@ -54,7 +54,7 @@ def test_a_pool_computes_the_same_meshes(toys, tmp_path):
     names = ["train/0.ply", "train/1.ply", "val/0.ply"]
     cache = Cache(tmp_path / "pool")
     jobs = [(toys._task(toys.source(name).mesh, 1), cache) for name in names]
-    assert len(list(run_in_pool(preprocessing._run, jobs, 2, "data.workers=1"))) == 3
+    assert len(list(run_in_pool(preprocessing.ensure_task, jobs, 2, "data.workers=1"))) == 3
     pooled = Remeshed(Toys(), cache, 1, "isotropic", 120)
     for name in names:
         here, there = toys.load(name).mesh, pooled.load(name).mesh

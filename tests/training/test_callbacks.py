@@ -22,7 +22,8 @@ def test_the_bar_and_its_metrics_fit(capfd, monkeypatch, columns, bar):
         current_epoch=98,
         num_training_batches=70,
         num_val_batches=[10],
-        global_step=0,
+        accumulate_grad_batches=1,
+        fit_loop=SimpleNamespace(epoch_loop=SimpleNamespace(total_batch_idx=-1)),
         is_global_zero=True,
         callback_metrics={
             "val/exact_match": torch.tensor(0.8749),

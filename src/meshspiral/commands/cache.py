@@ -25,6 +25,11 @@ def main(config: CacheConfig) -> None:
     now = time.time()
     for line in _table(cache.entries(), now):
         log.info(line)
+    if config.verify:
+        damaged = [entry.path for entry in cache.damaged()]  # a warning names each
+        for path in damaged:
+            path.unlink(missing_ok=True)
+        log.info("%d damaged files removed", len(damaged))
     if config.unused_days is None and config.max_gb is None:
         return
     most = None if config.max_gb is None else config.max_gb * 1e9

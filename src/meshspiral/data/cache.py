@@ -7,7 +7,7 @@ import inspect
 import logging
 import os
 import zlib
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from functools import cache
 from pathlib import Path
 from types import ModuleType
@@ -154,6 +154,13 @@ class Cache:
     def size(self) -> int:
         """Total size of all files in bytes."""
         return sum(entry.size for entry in self.entries())
+
+    def damaged(self) -> Iterator[Entry]:
+        """The files whose content does not agree with their checksum; each is read."""
+        for entry in self.entries():
+            kind, key = entry.path.parent.name, entry.path.stem
+            if entry.path.suffix == SUFFIX and self.load(kind, key) is None:
+                yield entry
 
     def prune(self, most: float | None, since: float | None) -> list[Entry]:
         """Remove the files whose last reading is longest ago.

@@ -143,7 +143,7 @@ class ShapeSet(ABC):
 
 def file_stamp(*paths: Path | None) -> str:
     """Names, sizes and times of files, for `ShapeSet.stamp`; a missing file has none."""
-    return "|".join(f"{path}:{_size_and_time(path)}" for path in paths if path)
+    return "|".join(f"{path.absolute()}:{_size_and_time(path)}" for path in paths if path)
 
 
 def _size_and_time(path: Path) -> str:

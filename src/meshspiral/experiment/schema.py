@@ -238,6 +238,7 @@ class CacheConfig(Settings):
     """Settings of `cache`."""
 
     cache_dir: Text = Field(description="the folder of cached results")
+    verify: bool = Field(description="read every file, and remove those that are damaged")
     unused_days: float | None = Field(
         ge=0, description="remove results that have not been read for so many days"
     )

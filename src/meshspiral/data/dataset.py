@@ -1,0 +1,100 @@
+"""The meshes of one split, read when they are served, and the order of an epoch."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+import torch
+from torch.utils._pytree import tree_leaves
+from torch.utils.data import Dataset, Sampler
+
+from meshspiral.data.cache import Arrays
+from meshspiral.data.prepared import Prepared, Recipe
+from meshspiral.neighbourhoods.base import Batch
+
+KEPT = 2**29  # bytes of a split that stay in memory
+
+
+class MeshDataset(Dataset):
+    """The tensors of one split. Item i is a dictionary, without a batch dimension.
+
+    Items are read when they are asked for. The first ones stay in memory, up to `KEPT` bytes.
+
+    Entries:
+        features: float32 [V, C], the descriptors.
+        labels: int64 [V], vertices of the template.
+        vertices: float32 [V, 3], centred.
+        unit: float32 [], the length by which metric information is divided.
+        index: int, i.
+        corners, weights: int64 [V, 3] and float64 [V, 3], only where the true point lies within a
+            face of the template: its vertices, and barycentric coordinates.
+        and those that the neighbourhood's `tensors` returns.
+
+    Args:
+        recipe: By which items are read.
+        prepared: The shapes of the split.
+        tables: Keys of the tables that several shapes have, with the tables once they are read.
+
+    Attributes:
+        names: Names of the shapes.
+        sizes: Their numbers of vertices, int64 [M].
+        kept: Bytes of the items in memory.
+    """
+
+    def __init__(
+        self, recipe: Recipe, prepared: Sequence[Prepared], tables: dict[str, Arrays | None]
+    ):
+        self.names = [each.name for each in prepared]
+        self.sizes = np.array([each.vertices for each in prepared])
+        self._recipe, self._prepared = recipe, prepared
+        self._items: dict[int, Batch] = {}
+        self.kept, self._tables = 0, tables
+
+    def __len__(self) -> int:
+        return len(self._prepared)
+
+    def __getitem__(self, i: int) -> Batch:
+        if i not in range(len(self)):
+            raise IndexError(f"{i} must be an item, 0..{len(self) - 1}")
+        item = self._items.get(i)
+        if item is None:
+            item = self._recipe.read(self._prepared[i], self._tables)
+            size = sum(t.nbytes for t in tree_leaves(item) if isinstance(t, torch.Tensor))
+            if self.kept + size <= KEPT:
+                self.kept += size
+                self._items[i] = item
+        return {**item, "index": i}
+
+
+class EpochSampler(Sampler[int]):
+    """A random order for every epoch, which depends on seed and epoch alone.
+
+    All processes of a run need equally many items: where the size does not divide, the first items
+    of the order are repeated at its end.
+
+    Args:
+        size: Number of items.
+        seed: Seed of the order.
+        skip: Number of items of this process to leave out at the start of the first epoch served:
+            those that a run had done before it was stopped.
+        rank: Number of this process.
+        world: Number of processes; this one serves every world-th item.
+    """
+
+    def __init__(self, size: int, seed: int, skip: int = 0, rank: int = 0, world: int = 1):
+        self.size, self.seed, self.skip, self.epoch = size, seed, skip, 0
+        self.rank, self.world = rank, world
+
+    def set_epoch(self, epoch: int) -> None:
+        """Lightning calls this before each epoch."""
+        self.epoch = epoch
+
+    def __len__(self) -> int:
+        return -(-self.size // self.world)
+
+    def __iter__(self) -> Iterator[int]:
+        order = np.random.default_rng([self.seed, self.epoch]).permutation(self.size)
+        order = np.resize(order, len(self) * self.world)[self.rank :: self.world].tolist()
+        skip, self.skip = self.skip, 0
+        yield from order[skip:]
