@@ -106,7 +106,7 @@ def test_the_root_setting_metric_overrides_model_metric():
         (["seq_len=0"], "seq_len must be at least 1, got 0"),
         (["seq_len=many"], "seq_len must be a whole number, got many"),
         (["model=foo"], "Could not find 'model/foo'; there are: conv, fcs, gcnn3, lstm"),
-        (["data=foo"], "there are: bodies, bodies_6890, bodies_6890_remeshed, bodies_mixed,"),
+        (["data=foo"], "there are: anny, bodies, bodies_6890, bodies_6890_remeshed, bodies_mixed,"),
         (["+metrics=true"], "unknown key metrics; did you mean metric?"),
         (["+rate=1"], "unknown key rate; known: seq_len"),
         (["metrics=true"], "unknown setting metrics; did you mean metric?"),
@@ -219,7 +219,7 @@ def test_help_shows_groups_settings_and_three_examples(cli):
         "data.raw.rings number of rings of the polar grid",
         "model.metric read metric information: distance and angle (conv, fcs, lstm)",
         "neighbourhood.rays number of rays of the polar grid, even (patch)",
-        "data.vertices vertices of the template and the bodies (bodies)",
+        "data.vertices vertices of the template and the bodies (anny, bodies)",
     ):
         assert line in lines
     assert len([line for line in lines if line.startswith("python -m")]) >= 3
