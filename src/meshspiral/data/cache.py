@@ -79,9 +79,7 @@ class Cache:
         """
         path = self.path(kind, key)
         try:
-            with safe_open(path, framework="pt") as file:
-                arrays = {name: file.get_tensor(name).numpy() for name in file.keys()}  # noqa: SIM118
-                about = file.metadata() or {}
+            arrays, about = _mapped(path)
         except FileNotFoundError:
             return None
         except (OSError, ValueError, KeyError, TypeError, RuntimeError, SafetensorError) as error:
@@ -181,6 +179,17 @@ class Cache:
                     entry.path.unlink()
                 removed.append(entry)
         return removed
+
+
+def _mapped(path: Path) -> tuple[Arrays, dict[str, str]]:
+    """The arrays of a file, and what it says about itself."""
+    while True:
+        inode = path.stat().st_ino
+        with safe_open(path, framework="pt") as file:
+            arrays = {name: file.get_tensor(name).numpy() for name in file.keys()}  # noqa: SIM118
+            about = file.metadata() or {}
+        if path.stat().st_ino == inode:  # else replaced between its header and its arrays
+            return arrays, about
 
 
 def _checksum(arrays: Arrays) -> str:
