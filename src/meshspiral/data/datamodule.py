@@ -14,7 +14,7 @@ from torch.utils._pytree import tree_leaves
 from torch.utils.data import DataLoader
 
 from meshspiral.data.cache import Cache
-from meshspiral.data.dataset import KEPT, EpochSampler, MeshDataset
+from meshspiral.data.dataset import KEPT, EpochSampler, MeshDataset, ignore_signals
 from meshspiral.data.descriptors import Features
 from meshspiral.data.prepared import Recipe
 from meshspiral.data.reference import ReferenceDistances
@@ -93,7 +93,8 @@ class CorrespondenceData(L.LightningDataModule):
     def setup(self, stage: str | None = None) -> None:
         splits = {"fit": ("train", "val"), "validate": ("val",), "test": ("test",)}
         wanted = [s for s in splits.get(stage, SPLITS) if s not in self.datasets]
-        self.prepare(wanted)
+        if wanted:
+            self.prepare(wanted)
 
     def prepare(self, wanted: list[str] | tuple[str, ...] = SPLITS) -> None:
         """Compute what is not cached for these splits.
@@ -144,9 +145,13 @@ class CorrespondenceData(L.LightningDataModule):
             item = dataset[0]
             size = sum(t.nbytes for t in tree_leaves(item) if isinstance(t, torch.Tensor))
             readers = int(size * dataset.sizes.sum() / dataset.sizes[0] > KEPT)
-        # forked processes could hang in libraries that had started threads
-        ahead = {"multiprocessing_context": "spawn", "persistent_workers": True} if readers else {}
-        return DataLoader(dataset, batch_size=None, sampler=sampler, num_workers=readers, **ahead)
+        ahead = {
+            "multiprocessing_context": "spawn",  # forks could hang in libraries that have threads
+            "persistent_workers": True,
+            "worker_init_fn": ignore_signals,
+        }
+        options = ahead if readers else {}
+        return DataLoader(dataset, batch_size=None, sampler=sampler, num_workers=readers, **options)
 
     def _rank_and_world(self) -> tuple[int, int]:
         trainer = self.trainer

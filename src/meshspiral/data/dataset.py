@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import signal
 from collections.abc import Iterator, Sequence
 
 import numpy as np
@@ -98,3 +99,13 @@ class EpochSampler(Sampler[int]):
         order = np.resize(order, len(self) * self.world)[self.rank :: self.world].tolist()
         skip, self.skip = self.skip, 0
         yield from order[skip:]
+
+
+def ignore_signals(reader: int) -> None:
+    """Leave Ctrl-C and SIGTERM, which reach all processes of a group, to the one that trains.
+
+    Args:
+        reader: Number of the process that reads.
+    """
+    for signum in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(signum, signal.SIG_IGN)
