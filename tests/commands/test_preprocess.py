@@ -8,6 +8,7 @@ import signal
 import threading
 import time
 from collections import Counter
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -72,16 +73,6 @@ def notes(folder: Path, what: str) -> list[list[int]]:
     return [list(map(int, line.split())) for line in lines]
 
 
-class Slow:
-    """Picklable by value of its folder."""
-
-    def __init__(self, folder: str):
-        self.folder = folder
-
-    def __call__(self, item: int) -> int:
-        return slow_job(self.folder, item)
-
-
 @pytest.fixture
 def cluster():
     distributed = pytest.importorskip("distributed", reason="pip install 'dask[distributed]'")
@@ -100,7 +91,7 @@ def test_a_cluster_loses_nothing_when_a_worker_is_killed(cluster, tmp_path):
     killer = threading.Thread(target=kill)
     killer.start()
     with on_cluster(cluster.scheduler_address):
-        results = run_all(Slow(str(tmp_path)), range(40), None, "Jobs")
+        results = run_all(partial(slow_job, str(tmp_path)), range(40), None, "Jobs")
     killer.join()
     assert results == [item * item for item in range(40)]
     begun, done = (Counter(item for item, _ in notes(tmp_path, w)) for w in ("begun", "done"))

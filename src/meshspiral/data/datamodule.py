@@ -9,12 +9,10 @@ from itertools import islice
 
 import lightning as L
 import numpy as np
-import torch
-from torch.utils._pytree import tree_leaves
 from torch.utils.data import DataLoader
 
 from meshspiral.data.cache import Cache
-from meshspiral.data.dataset import KEPT, EpochSampler, MeshDataset, ignore_signals
+from meshspiral.data.dataset import KEPT, EpochSampler, MeshDataset, ignore_signals, item_bytes
 from meshspiral.data.descriptors import Features
 from meshspiral.data.prepared import Recipe
 from meshspiral.data.reference import ReferenceDistances
@@ -142,9 +140,7 @@ class CorrespondenceData(L.LightningDataModule):
         dataset = self.datasets[split]
         readers = self.readers
         if readers is None:
-            item = dataset[0]
-            size = sum(t.nbytes for t in tree_leaves(item) if isinstance(t, torch.Tensor))
-            readers = int(size * dataset.sizes.sum() / dataset.sizes[0] > KEPT)
+            readers = int(item_bytes(dataset[0]) * dataset.sizes.sum() / dataset.sizes[0] > KEPT)
         ahead = {
             "multiprocessing_context": "spawn",  # forks could hang in libraries that have threads
             "persistent_workers": True,

@@ -61,11 +61,16 @@ class MeshDataset(Dataset):
         item = self._items.get(i)
         if item is None:
             item = self._recipe.read(self._prepared[i], self._tables)
-            size = sum(t.nbytes for t in tree_leaves(item) if isinstance(t, torch.Tensor))
+            size = item_bytes(item)
             if self.kept + size <= KEPT:
                 self.kept += size
                 self._items[i] = item
         return {**item, "index": i}
+
+
+def item_bytes(item: Batch) -> int:
+    """The bytes of an item's tensors."""
+    return sum(leaf.nbytes for leaf in tree_leaves(item) if isinstance(leaf, torch.Tensor))
 
 
 class EpochSampler(Sampler[int]):

@@ -23,8 +23,7 @@ class Range(NamedTuple):
     most: float
 
 
-# Active ranges of motion of adults, rounded (American Academy of Orthopaedic Surgeons 1965),
-# narrowed where the skin of a simple rig folds.
+# chosen by us, within what adults can do
 TRUNK = {
     "lean_forward": Range(-15, 0, 50),  # of the whole body at the hips
     "lean_left": Range(-10, 0, 10),

@@ -77,7 +77,7 @@ def quiet() -> None:
     for name in ("lightning.pytorch", "lightning.fabric", "lightning_fabric"):
         logging.getLogger(name).setLevel(logging.WARNING)
     for message in (
-        ".*does not have many workers.*",  # all tensors are in memory
+        ".*does not have many workers.*",  # the data module chooses how many read
         ".*exists and is not empty.*",  # a resumed run
         ".*`isinstance.treespec, LeafSpec.` is deprecated.*",
         ".*smaller than the logging interval.*",

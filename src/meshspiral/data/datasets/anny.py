@@ -150,7 +150,7 @@ class Surface:
 
 
 class BodyModel:
-    """Anny, with the mean of its two ways of skinning: that folds the surface less than either."""
+    """Anny, skinned by the mean of linear blending and of dual quaternions."""
 
     def __init__(self) -> None:
         import anny
