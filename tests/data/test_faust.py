@@ -365,6 +365,7 @@ def test_each_shape_can_be_remeshed_separately(name, extracted, tmp_path):
         "policy": "isotropic",
         "vertices": None,
         "copies": 1,
+        "shared": None,
     }
     words = [f"data={name}", *root, "data.remesh.vertices=300", f"data.cache_dir={tmp_path}"]
     shapes = open_shapes(composed([*words, "data.workers=1"]).data)

@@ -6,15 +6,19 @@ import json
 
 import numpy as np
 import pytest
+import trimesh
 
 from meshspiral.data import preprocessing
 from meshspiral.data.cache import Cache
 from meshspiral.data.pool import run_in_pool
 from meshspiral.data.remeshed import Remeshed, usual_size
-from meshspiral.data.shapes import DataError, ShapeSet, registered_shape
+from meshspiral.data.shapes import DataError, Shape, ShapeSet, SurfacePoints, registered_shape
 from meshspiral.evaluation.outcome import Outcome
 from meshspiral.experiment.run_folder import ERRORS, METRICS
 from meshspiral.geometry import remesh as module
+from meshspiral.geometry.barycentric import interpolate
+from meshspiral.geometry.mesh import Mesh
+from meshspiral.geometry.remesh import closest_points
 from tests import helpers
 from tests.conftest import toy_shapes
 from tests.helpers import run
@@ -48,6 +52,57 @@ def test_a_shape_is_remeshed_once_and_cached(toys, monkeypatch):
     np.testing.assert_array_equal(shape.mesh.vertices, again.mesh.vertices)
     with pytest.raises(TypeError):
         toys.load("val/0.ply")
+
+
+def test_training_shapes_may_share_tessellations(tmp_path):
+    shapes = Remeshed(Toys(), Cache(tmp_path), 1, "isotropic", 120, copies=3, shared=1)
+    names = shapes.names["train"]
+    assert len(names) == 6
+    first, *others = (shapes.load(name) for name in names)
+    for other in others:
+        np.testing.assert_array_equal(other.mesh.faces, first.mesh.faces)
+        np.testing.assert_array_equal(other.points.weights, first.points.weights)
+    registered = Toys().load("train/1.ply").mesh
+    _, _, off = closest_points(
+        registered, shapes.load("train/1.ply").mesh.vertices, np.full((120, 3), np.nan)
+    )
+    assert off.max() < 1e-9  # the shape's own surface, not that of the first
+    own = shapes.load("val/0.ply").mesh
+    assert own.faces.shape != first.mesh.faces.shape or (own.faces != first.mesh.faces).any()
+    with pytest.raises(DataError, match="at most 2, the number of training shapes, got 3"):
+        Remeshed(Toys(), Cache(tmp_path), 1, "isotropic", 120, shared=3)
+
+
+def test_each_shape_draws_its_size_from_a_range(tmp_path):
+    shapes = Remeshed(Toys(), Cache(tmp_path), 1, "isotropic", [80, 160], copies=3)
+    sizes = {len(shapes.load(name).mesh.vertices) for name in shapes.names["train"]}
+    assert len(sizes) > 3 and min(sizes) >= 80 and max(sizes) <= 160
+
+
+def test_labels_of_a_finer_surface_are_points_of_the_template(tmp_path):
+    class Finer(Toys):
+        """The shapes with faces split in four; new vertices are midpoints of the template's."""
+
+        def load(self, name):
+            coarse = super().load(name).mesh
+            vertices, faces = trimesh.remesh.subdivide(coarse.vertices, coarse.faces)
+            points, _ = trimesh.remesh.subdivide(self.template.vertices, self.template.faces)
+            face, weights, _ = closest_points(self.template, points, np.full_like(points, np.nan))
+            corners = self.template.faces[face].astype(np.int64)
+            labels = corners[np.arange(len(corners)), weights.argmax(axis=1)]
+            size = len(self.template.vertices)
+            return Shape(Mesh(vertices, faces), labels, size, SurfacePoints(corners, weights))
+
+    toys = Finer()
+    shape = Remeshed(toys, Cache(tmp_path), 1, "isotropic", 120).load("test/0.ply")
+    template, registered = toys.template, Toys().load("test/0.ply").mesh
+    face, weights, _ = closest_points(
+        registered, shape.mesh.vertices, np.full_like(shape.mesh.vertices, np.nan)
+    )
+    expected = interpolate(template.vertices, template.faces[face], weights)
+    found = interpolate(template.vertices, *shape.points)
+    edge = np.linalg.norm(np.diff(template.vertices[template.faces[:, :2]], axis=1), axis=2).mean()
+    assert np.linalg.norm(found - expected, axis=1).max() < 0.1 * edge
 
 
 def test_a_pool_computes_the_same_meshes(toys, tmp_path):

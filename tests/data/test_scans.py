@@ -26,7 +26,8 @@ def test_a_mesh_without_defects_has_no_remarks():
     "vertices, faces, remark",
     [
         (np.concatenate([V, V + 9]), np.concatenate([F, F + len(V)]), "components: 2"),
-        (V, F[5:], "the surface has a boundary"),
+        (V, F[5:], "small holes closed for the labels, with faces: 5"),
+        (V, F[: len(F) // 2], "the surface has a boundary"),
         (
             V[F.ravel()],
             np.arange(F.size).reshape(-1, 3),
@@ -53,7 +54,7 @@ def test_a_surface_that_was_inside_out_faces_outwards():
     np.testing.assert_allclose(scan(V, F[:, ::-1], "a").mesh.face_normals, SPHERE.face_normals)
     opened = scan(V, F[9:, ::-1], "a")
     assert opened.remarks[0] == "inside-out components turned outwards: 1"
-    np.testing.assert_allclose(opened.mesh.face_normals, SPHERE.face_normals[9:])
+    np.testing.assert_allclose(opened.mesh.face_normals[:311], SPHERE.face_normals[9:])
 
 
 def test_each_component_is_turned_by_itself_and_a_sheet_never():

@@ -38,7 +38,7 @@ class Task:
 def frame_task(mesh: Mesh, frame: Frame) -> Task:
     """The local frames of a mesh: `frames` float32 [V, 3, 3], see `local_frames`."""
     version = code_version(meshes, shot, sys.modules[__name__])
-    key = digest(mesh.vertices, mesh.faces, *frame, version)
+    key = digest(mesh.vertices, mesh.faces, mesh.whole, *frame, version)
     return Task("frames", key, _frames, (mesh, frame))
 
 
@@ -50,6 +50,7 @@ def descriptor_task(mesh: Mesh, descriptor: Descriptor, half: bool = False) -> T
         repr(sorted(descriptor.settings.model_dump().items())),
         mesh.vertices,
         mesh.faces,
+        mesh.whole,
         code_version(*descriptor.modules, *sources(descriptor), meshes, sys.modules[__name__]),
     )
     compute = partial(_described, descriptor, np.float16 if half else np.float32)
@@ -82,7 +83,7 @@ def _inputs(described: Descriptor | Neighbourhood, mesh: Mesh) -> tuple:
 def _frames(mesh: Mesh, frame: Frame) -> Arrays:
     _check_area(mesh)
     masses = mesh.vertex_areas if frame.by_area else None
-    radius = frame.support * np.sqrt(mesh.area)
+    radius = frame.support * mesh.size
     return {"frames": shot.local_frames(mesh.centred, radius, masses)}
 
 

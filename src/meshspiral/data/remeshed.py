@@ -30,11 +30,15 @@ class Remeshed(ShapeSet):
         cache: Cache of the remeshed shapes.
         workers: Number of processes; None for one per core.
         policy: Kind of tessellation (see `meshspiral.geometry.remesh.remesh`).
-        vertices: Number of vertices of a remeshed shape; None for `usual_size` of the template.
+        vertices: Number of vertices of a remeshed shape, or a range from which each shape draws its
+            number, as often small as large; None for `usual_size` of the template.
         copies: Number of tessellations of each training shape. Copy k > 1 is named "<name>~k".
+        shared: Number of tessellations that the training shapes share, which saves the time of
+            remeshing each: a shape is remeshed as the one whose tessellation it draws. All must
+            have the same faces. None: every shape has its own.
 
     Raises:
-        DataError: PyMeshLab is not installed.
+        DataError: PyMeshLab is not installed, or `shared` is more than the training shapes.
     """
 
     def __init__(
@@ -43,8 +47,9 @@ class Remeshed(ShapeSet):
         cache: Cache,
         workers: int | None,
         policy: str,
-        vertices: int | None,
+        vertices: int | list[int] | None,
         copies: int = 1,
+        shared: int | None = None,
     ) -> None:
         try:
             self._version = version("pymeshlab")
@@ -59,23 +64,46 @@ class Remeshed(ShapeSet):
             f"{name}~{copy}": (name, copy) for copy in range(2, copies + 1) for name in originals
         }
         self.names = {**base.names, "train": [*originals, *self._copies]}
+        if shared and shared > len(originals):
+            raise DataError(
+                f"data.remesh.shared must be at most {len(originals)}, the number of training "
+                f"shapes, got {shared}"
+            )
+        self._shared = originals[:: len(originals) // shared][:shared] if shared else []
+        self._train = set(self.names["train"])
 
     def prepare(self, names: list[str]) -> None:
         self._base.prepare(sorted({self._original(name)[0] for name in names}))
-        tasks = [self._task(self.source(name).mesh, self._original(name)[1]) for name in names]
+        tasks = [self._tessellation(name)[1] for name in names]
         run_tasks(tasks, self._cache, self._workers, "Remeshing")
 
     def load(self, name: str) -> Shape:
         source = self.source(name)
-        arrays = load_task(self._task(source.mesh, self._original(name)[1]), self._cache)
-        corners = source.labels[source.mesh.faces[arrays["face"]]]
-        shape = Mesh(arrays["vertices"], arrays["faces"], source.mesh.name)
+        pattern, task = self._tessellation(name)
+        arrays = load_task(task, self._cache)
+        corners, weights = source.mesh.faces[arrays["face"]], arrays["weights"]
+        vertices = arrays["vertices"]
+        if pattern is not None:
+            if not np.array_equal(pattern.mesh.faces, source.mesh.faces):
+                raise DataError(
+                    f"{name}: the faces are not those of {pattern.mesh.name}; data.remesh.shared "
+                    "needs shapes with the same faces"
+                )
+            vertices = interpolate(source.mesh.vertices, corners, weights)
+        mesh = Mesh(vertices, arrays["faces"], source.mesh.name)
         template = self.template.vertices
-        point = interpolate(template, corners, arrays["weights"])
+        if source.points is None:
+            corners = source.labels[corners]
+            point = interpolate(template, corners, weights)
+        else:
+            place = interpolate(template, *source.points)
+            point = interpolate(place, corners, weights)
+            any_normal = np.full_like(point, np.nan)
+            face, weights, _ = remesh.closest_points(self.template, point, any_normal)
+            corners = self.template.faces[face]
         nearest = np.linalg.norm(template[corners] - point[:, None], axis=2).argmin(axis=1)
         labels = corners[np.arange(len(corners)), nearest]
-        points = SurfacePoints(corners, arrays["weights"])
-        return Shape(shape, labels, len(template), points)
+        return Shape(mesh, labels, len(template), SurfacePoints(corners, weights))
 
     def stamp(self, name: str) -> str | None:
         original, copy = self._original(name)
@@ -83,7 +111,10 @@ class Remeshed(ShapeSet):
         if stamp is None:
             return None
         code = code_version(remesh, meshes, sys.modules[__name__])
-        return f"{stamp}|{self._policy}|{self._vertices}|{copy}|{code}|{self._version}"
+        settings = f"{self._policy}|{self._vertices}|{copy}|{len(self._shared)}"
+        if name in self._train:
+            settings += "".join(str(self._base.stamp(each)) for each in self._shared[:1])
+        return f"{stamp}|{settings}|{code}|{self._version}"
 
     def source(self, name: str) -> Shape:
         """The original of a remeshed shape.
@@ -101,12 +132,24 @@ class Remeshed(ShapeSet):
         """Name of the shape in the other data set, and the number of this copy, counted from 1."""
         return self._copies.get(name, (name, 1))
 
+    def _tessellation(self, name: str) -> tuple[Shape | None, Task]:
+        """The shape whose tessellation a shape shares, None if it has its own; and its task."""
+        if name in self._train and self._shared:
+            drawn = derived_seed("tessellation", name) % len(self._shared)
+            pattern = self._base.load(self._shared[drawn])
+            return pattern, self._task(pattern.mesh, 1)
+        return None, self._task(self.source(name).mesh, self._original(name)[1])
+
     def _task(self, source: Mesh, copy: int) -> Task:
         content = (source.vertices, source.faces, self._policy, *([copy] if copy > 1 else []))
         code = code_version(remesh, meshes)
-        key = digest(*content, self._vertices, code, self._version)
         seed = derived_seed(*content)
-        return Task("meshes", key, _remesh, (source, self._vertices, self._policy, seed))
+        vertices = self._vertices
+        if isinstance(vertices, list):
+            draw = np.random.default_rng(derived_seed(*content, "vertices")).uniform
+            vertices = round(np.exp(draw(*np.log(vertices))))
+        key = digest(*content, vertices, code, self._version)
+        return Task("meshes", key, _remesh, (source, vertices, self._policy, seed))
 
 
 def usual_size(vertices: int) -> int:

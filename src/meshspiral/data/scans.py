@@ -9,6 +9,7 @@ import numpy as np
 import trimesh
 
 from meshspiral.data.mesh_files import read_arrays
+from meshspiral.geometry.holes import close_holes
 from meshspiral.geometry.mesh import Mesh, MeshError, in_use
 from meshspiral.geometry.repair import outwards
 from meshspiral.geometry.repair import repair as repair_arrays
@@ -22,7 +23,7 @@ class Scan(NamedTuple):
     Attributes:
         vertices: float [V, 3], as given.
         faces: int [F, 3], as given.
-        mesh: W vertices, each on a face, oriented outwards.
+        mesh: W vertices, each on a face, oriented outwards; small holes are closed.
         vertex_of: int64 [V], the vertex of `mesh` for every given vertex; -1 if it is on no face.
         origin: int64 [W], the given vertex for every vertex of `mesh`.
         remarks: Repairs and defects of the mesh, for the user.
@@ -94,6 +95,10 @@ def scan(vertices: np.ndarray, faces: np.ndarray, name: str, repair: bool = Fals
     mesh, turned = outwards(Mesh(mesh.vertices[used], faces_of_used, name))
     if turned:
         remarks.append(f"inside-out components turned outwards: {turned:,}")
+    closed = close_holes(mesh)
+    if added := len(closed.faces) - len(mesh.faces):
+        remarks.append(f"small holes closed for the labels, with faces: {added:,}")
+    mesh = closed
     if isolated := int((vertex_of < 0).sum()):
         remarks.append(f"vertices on no face, without a match: {isolated:,} of {len(vertex_of):,}")
     if flat := int((np.linalg.norm(mesh.face_normals, axis=1) == 0).sum()):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, BeforeValidator, Field
+from pydantic import BaseModel, BeforeValidator, Field, field_validator
 
 
 def _as_text(value: Any) -> Any:
@@ -43,10 +43,41 @@ class RemeshSettings(Strict):
     policy: Literal["isotropic", "adaptive", "refined", "simplified", "marching", "mixed"] = Field(
         description="kind of tessellation; mixed draws one for every shape"
     )
-    vertices: int | None = Field(
-        ge=12, description="vertices of a remeshed shape; null: 5000 for a template of 6890"
+    vertices: int | list[int] | None = Field(
+        description="vertices of a remeshed shape, or a range, from which each draws its number; "
+        "null: 5000 for a template of 6890"
     )
     copies: int = Field(ge=1, description="tessellations of each training shape")
+    shared: int | None = Field(
+        ge=1,
+        description="tessellations that registered training shapes share, which saves remeshing "
+        "each; null: every shape has its own",
+    )
+
+    @field_validator("vertices")
+    @classmethod
+    def _enough(cls, vertices: int | list[int] | None) -> int | list[int] | None:
+        if isinstance(vertices, list):
+            if len(vertices) != 2 or not 12 <= vertices[0] <= vertices[1]:
+                raise ValueError("must be a number of at least 12, or a range [least, most]")
+        elif vertices is not None and vertices < 12:
+            raise ValueError("must be at least 12")
+        return vertices
+
+
+class DamageSettings(Strict):
+    """Damage of the training shapes, drawn for each. Lengths are over sqrt(area)."""
+
+    noise: float = Field(ge=0, description="largest standard deviation of the vertices' noise")
+    share: float = Field(ge=0, le=1, description="share of the shapes that lose parts")
+    cut: float = Field(ge=0, le=1, description="share of these that are cut by a plane")
+    holes: int = Field(ge=0, description="most holes in these")
+    hole_radius: float = Field(ge=0, description="largest radius of a hole")
+    missing: float = Field(ge=0, lt=1, description="most of their faces that miss, as a share")
+    size: float = Field(
+        ge=0, description="largest error of the size by which radii are scaled, as a share"
+    )
+    seed: int = Field(ge=0, description="seed of the damage")
 
 
 class DataSettings(Strict):
@@ -54,6 +85,9 @@ class DataSettings(Strict):
 
     name: str
     remesh: RemeshSettings | None = Field(description="remesh every shape; null: as it is")
+    damage: DamageSettings | None = Field(
+        description="damage the training shapes as scans are; null: as they are"
+    )
     features: Names = Field(
         min_length=1, description="descriptors, one or a list: shot, raw, xyz (not invariant)"
     )

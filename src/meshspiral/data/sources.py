@@ -6,6 +6,7 @@ from typing import Any
 
 import meshspiral.data.datasets  # noqa: F401  registers the data sets
 from meshspiral.data.cache import Cache
+from meshspiral.data.damaged import Damaged
 from meshspiral.data.datamodule import CorrespondenceData
 from meshspiral.data.descriptors import Features
 from meshspiral.data.remeshed import Remeshed
@@ -24,7 +25,9 @@ def open_shapes(settings: DataSettings) -> ShapeSet:
     shapes = ShapeSet.registered[settings.name](**settings.own())
     if settings.remesh is not None:
         cache = Cache(settings.cache_dir)
-        return Remeshed(shapes, cache, settings.workers, **settings.remesh.model_dump())
+        shapes = Remeshed(shapes, cache, settings.workers, **settings.remesh.model_dump())
+    if settings.damage is not None:
+        shapes = Damaged(shapes, settings.damage)
     return shapes
 
 

@@ -51,7 +51,7 @@ def described_tensors(arrays: Sequence[Arrays], mesh: Mesh, features: Features) 
     return {
         "features": columns[0] if len(columns) == 1 else torch.cat(columns, dim=1),
         "vertices": torch.from_numpy(mesh.centred.astype(np.float32)),
-        "unit": torch.tensor(features.unit * np.sqrt(mesh.area), dtype=torch.float32),
+        "unit": torch.tensor(features.unit * mesh.size, dtype=torch.float32),
     }
 
 

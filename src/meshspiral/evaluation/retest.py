@@ -60,7 +60,7 @@ def config_on_data(trained: TrainConfig, requested: dict[str, Any]) -> TrainConf
     data = trained.data.model_dump()
     if "name" in given:
         own = trained.data.own().keys() | {"name"}
-        data = {key: data[key] for key in data.keys() - own} | {"remesh": None}
+        data = {key: data[key] for key in data.keys() - own} | {"remesh": None, "damage": None}
     merged = OmegaConf.to_container(OmegaConf.merge(data, given))
     return read_stored_config(trained.model_dump() | {"data": merged}, "this evaluation")
 

@@ -9,7 +9,7 @@ from omegaconf import OmegaConf
 from pydantic import BaseModel
 
 from meshspiral.data.descriptors import Descriptor
-from meshspiral.data.settings import DataSettings, RemeshSettings
+from meshspiral.data.settings import DamageSettings, DataSettings, RemeshSettings
 from meshspiral.experiment.program import command_line
 from meshspiral.experiment.schema import (
     GROUPS,
@@ -72,6 +72,7 @@ def settings_help(command: str, conf: Path) -> str:
             "data.": DataSettings,
             **{f"data.{name}.": each.Settings for name, each in Descriptor.registered.items()},
             "data.remesh.": RemeshSettings,
+            "data.damage.": DamageSettings,
         }
         for prefix, schema in parts.items():
             lines += _settings(schema, prefix)
@@ -86,7 +87,7 @@ def _groups(command: str, conf: Path) -> list[str]:
     defaults = OmegaConf.to_container(OmegaConf.load(conf / f"{command}.yaml"))["defaults"]
     used = {key for entry in defaults if isinstance(entry, dict) for key in entry}
     used |= {"neighbourhood"} if "model" in used else set()
-    used |= {"data/remesh"} if "data" in used else set()
+    used |= {"data/remesh", "data/damage"} if "data" in used else set()
     lines = []
     for group in sorted(used - set(HIDDEN_GROUPS)):
         options = sorted(path.stem for path in (conf / group).glob("*.yaml"))

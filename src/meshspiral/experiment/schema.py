@@ -370,7 +370,11 @@ def upgraded(values: dict[str, Any]) -> dict[str, Any]:
         model.setdefault("metric_layers", "all")
     if data.get("remesh"):
         data["remesh"].setdefault("copies", 1)
+        data["remesh"].setdefault("shared", None)
     data.setdefault("remesh", None)
+    data.setdefault("damage", None)
+    if data.get("name") == "anny":
+        data.setdefault("surface", None)
     data.setdefault("features", ["shot"])
     if isinstance(data.get("shot"), dict):
         data["shot"].setdefault("by_area", False)

@@ -10,10 +10,10 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from meshspiral.geometry.faces import directed_edges, without_repeats
+from meshspiral.geometry.holes import close_holes
 from meshspiral.geometry.mesh import Mesh, MeshError, in_use
 
 CLEARLY = 0.05  # share of the volume of a sphere, see `outwards`
-HOLE = 0.1  # radius of the bounding sphere of a small hole, in square roots of the surface area
 
 
 class Repaired(NamedTuple):
@@ -42,9 +42,9 @@ def repair(vertices: np.ndarray, faces: np.ndarray, name: str) -> Repaired:
     2. Join vertices at equal coordinates, and remove the faces that thereby lose their area or
        repeat another.
     3. Cut the surface open along edges with more than two faces.
-    4. Close the holes that are no larger than HOLE, without new vertices.
-    5. Turn faces to agree with their neighbours, and cut the surface open along the edges where
+    4. Turn faces to agree with their neighbours, and cut the surface open along the edges where
        they cannot.
+    5. Close small holes, see `close_holes`.
 
     Args:
         vertices: float [V, 3], coordinates.
@@ -93,9 +93,6 @@ def repair(vertices: np.ndarray, faces: np.ndarray, name: str) -> Repaired:
     nonmanifold = _multiplicity(np.sort(directed_edges(faces), axis=1)) > 2
     vertices, faces, origin, cuts = _cut_open(vertices, faces, nonmanifold)
     note(cuts, "edges with more than two faces cut open")
-    before = len(faces)
-    faces = _fill_holes(vertices, faces)
-    note(len(faces) - before, "faces added to close holes")
     turned = _turned(vertices, faces)
     note(int((turned != faces).any(axis=1).sum()), "faces turned to agree with their neighbours")
     inconsistent = _multiplicity(directed_edges(turned)) > 1
@@ -106,7 +103,8 @@ def repair(vertices: np.ndarray, faces: np.ndarray, name: str) -> Repaired:
     used, faces = in_use(faces)
     new_index = np.full(len(joined) + 1, -1)  # the last element is that of index -1
     new_index[origin[used][::-1]] = np.arange(len(used))[::-1]  # the first copy of a vertex counts
-    mesh = Mesh(vertices[used], faces, name)
+    mesh = close_holes(Mesh(vertices[used], faces, name))
+    note(len(mesh.faces) - len(faces), "faces added to close holes")
     return Repaired(mesh, new_index[np.where(finite, joined, -1)], origin[used], changes)
 
 
@@ -136,7 +134,7 @@ def outwards(mesh: Mesh) -> tuple[Mesh, int]:
     sphere = area**1.5 / (6 * np.sqrt(np.pi))
     inside_out = volume < np.where(closed, 0.0, -CLEARLY * sphere)
     faces = np.where(inside_out[piece][:, None], mesh.faces[:, ::-1], mesh.faces)
-    return Mesh(mesh.vertices, faces, mesh.name), int(inside_out.sum())
+    return mesh.with_faces(faces), int(inside_out.sum())
 
 
 def _pieces(vertices: np.ndarray, faces: np.ndarray) -> tuple[int, np.ndarray, np.ndarray]:
@@ -172,25 +170,6 @@ def _joined(vertices: np.ndarray, finite: np.ndarray) -> np.ndarray:
     joined = np.arange(len(vertices))
     joined[sound] = sound[first[inverse.reshape(-1)]]
     return joined
-
-
-def _fill_holes(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """The faces, followed by faces that close the holes no larger than HOLE."""
-    import pyvista  # slow to import: one second
-
-    corners = vertices[faces]
-    with np.errstate(over="ignore", invalid="ignore"):
-        normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-        area = np.linalg.norm(normals, axis=1).sum() / 2
-    if not 0 < area < np.inf:
-        return faces
-    surface = pyvista.make_tri_mesh(vertices, faces).fill_holes(HOLE * np.sqrt(area))
-    filled = surface.triangulate().regular_faces.astype(np.int64)
-    filled[len(faces) :] = filled[len(faces) :, ::-1]  # VTK winds them along the boundary
-    filled = without_repeats(filled)
-    refused = (_multiplicity(np.sort(directed_edges(filled), axis=1)) > 2).any(axis=1)
-    refused[: len(faces)] = False  # only new faces at edges with more than two faces
-    return filled[~refused]
 
 
 def _multiplicity(edges: np.ndarray) -> np.ndarray:

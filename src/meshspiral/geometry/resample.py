@@ -68,7 +68,7 @@ def resample(mesh: Mesh, vertices: int) -> Resampled:
             f"{mesh.name}: nothing is left of the surface when it is resampled to "
             f"{vertices} vertices"
         )
-    resampled = Mesh(points[used], faces, mesh.name)
+    resampled = Mesh(points[used], faces, mesh.name, mesh.whole)
     projections = [
         closest_points(
             resampled,

@@ -296,10 +296,10 @@ def nearest_vertices(source: Labels, target: Labels) -> np.ndarray:
 
 
 def normalize(mesh: Mesh) -> Mesh:
-    """The mesh with its bounding box centred at the origin, scaled to an area of 1.
+    """The mesh with its bounding box centred at the origin, scaled to a size of 1.
 
     Results then do not depend on the mesh's position and unit of length.
     """
     used = mesh.vertices[mesh.faces].reshape(-1, 3)
     centred = mesh.vertices - (used.min(axis=0) / 2 + used.max(axis=0) / 2)  # the sum may overflow
-    return Mesh(centred / np.sqrt(mesh.area), mesh.faces, mesh.name)
+    return Mesh(centred / mesh.size, mesh.faces, mesh.name, None if mesh.whole is None else 1.0)

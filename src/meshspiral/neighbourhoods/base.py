@@ -98,7 +98,7 @@ class Neighbourhood(ABC):
 
     def mesh_key(self, mesh: Mesh) -> tuple:
         """The arrays of the mesh on which `compute` depends; by default all of it."""
-        return mesh.vertices, mesh.faces
+        return mesh.vertices, mesh.faces, mesh.whole
 
     @abstractmethod
     def compute(self, mesh: Mesh) -> Arrays:

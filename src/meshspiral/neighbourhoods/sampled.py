@@ -102,7 +102,7 @@ class Sampled(Neighbourhood, name="sampled"):
             known = np.isfinite(directions)
             start = np.where(known, directions, start)
         in_area = self.settings.relative_to == "area"
-        unit = np.sqrt(mesh.area) if in_area else geodesics.diameter(mesh)
+        unit = mesh.size if in_area else geodesics.diameter(mesh)
         grid = (self.settings.rings, self.settings.rays, start)
         tables = [sampling.sampled_places(mesh, radius * unit, *grid) for radius in self._radii]
         arrays: Arrays = {"known": known}

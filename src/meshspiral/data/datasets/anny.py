@@ -16,8 +16,9 @@ from meshspiral.data import posing
 from meshspiral.data.cache import code_version
 from meshspiral.data.datasets.bodies import Bodies, Size
 from meshspiral.data.settings import DataSettings
-from meshspiral.data.shapes import DataError, Shape, ShapeSet, registered_shape
+from meshspiral.data.shapes import DataError, Shape, ShapeSet, SurfacePoints, registered_shape
 from meshspiral.geometry.mesh import Mesh
+from meshspiral.geometry.remesh import closest_points
 
 NEEDED = ("anny", "pymeshlab")
 TRIES = 8  # of the poses drawn, that which folds the surface least is taken
@@ -30,10 +31,12 @@ class Anny(ShapeSet, name="anny"):
 
     Every body follows from the seed and its name alone: "train_0003_07" is pose 7 of person 3 of
     the people to train on. Validation and test show 10 other people each, whose bodies do not
-    depend on `subjects`. Vertex i has label i.
+    depend on `subjects`.
 
     Args:
-        vertices: 1500, or 6890 as in FAUST.
+        vertices: Size of the template: 1500, or 6890 as in FAUST.
+        surface: Number of vertices of the bodies; None for that of the template, whose vertex i is
+            then vertex i. Finer bodies are smoother; labels are still vertices of the template.
         subjects: Number of people to train on.
         poses: Number of poses of each person.
         ages: "adults", or "all" for children and elders too.
@@ -46,7 +49,10 @@ class Anny(ShapeSet, name="anny"):
     up = "z"
 
     class Settings(DataSettings):
-        vertices: Size = Field(description="vertices of the template and the bodies")
+        vertices: Size = Field(description="vertices of the template")
+        surface: Size | None = Field(
+            description="vertices of the bodies, before remeshing; null: as the template"
+        )
         subjects: int = Field(ge=1, description="number of people to train on")
         poses: int = Field(ge=1, description="number of poses of each person")
         ages: Literal["adults", "all"] = Field(
@@ -54,11 +60,20 @@ class Anny(ShapeSet, name="anny"):
         )
         people_seed: int = Field(ge=0, description="seed of people and poses")
 
-    def __init__(self, vertices: int, subjects: int, poses: int, ages: str, people_seed: int):
+    def __init__(
+        self,
+        vertices: int,
+        subjects: int,
+        poses: int,
+        ages: str,
+        people_seed: int,
+        surface: int | None = None,
+    ):
         if missing := [name for name in NEEDED if importlib.util.find_spec(name) is None]:
             raise DataError(f"data=anny needs {', '.join(missing)}: pip install -e '.[anny]'")
-        self._size, self._ages, self._seed = vertices, ages, people_seed
+        self._size, self._ages, self._seed = surface or vertices, ages, people_seed
         self.template = Bodies(vertices).template
+        self._bodies = Bodies(self._size).template
         people = {"train": subjects, "val": TESTED, "test": TESTED}
         self._numbers = {
             f"{split}_{person:04d}_{pose:02d}": (i, person, pose)
@@ -81,15 +96,30 @@ class Anny(ShapeSet, name="anny"):
         tried = []
         for _ in range(TRIES):
             vertices = self._surface.of(body_model().posed(traits, posing.draw_pose(rng)))
-            mesh = Mesh(vertices, self.template.faces, name)
+            mesh = Mesh(vertices, self._bodies.faces, name)
             tried.append((folded_faces(mesh), mesh))
             if tried[-1][0] == 0:
                 break
-        return registered_shape(min(tried, key=lambda each: each[0])[1], self.template)
+        mesh = min(tried, key=lambda each: each[0])[1]
+        if self._labels is None:
+            return registered_shape(mesh, self.template)
+        return Shape(mesh, *self._labels)
 
     def stamp(self, name: str) -> str:
         code = code_version(posing, sys.modules[__name__])
-        return f"{name} {self._size} {self._ages} {self._seed} {version('anny')} {code}"
+        sizes = f"{len(self.template.vertices)} {self._size}"
+        return f"{name} {sizes} {self._ages} {self._seed} {version('anny')} {code}"
+
+    @cached_property
+    def _labels(self) -> tuple[np.ndarray, int, SurfacePoints] | None:
+        """The fields of `Shape` after the mesh; None if the bodies have the template's vertices."""
+        template, bodies = self.template, self._bodies
+        if len(template.vertices) == self._size:
+            return None
+        face, weights, _ = closest_points(template, bodies.vertices, bodies.vertex_normals)
+        corners = template.faces[face].astype(np.int64)
+        labels = corners[np.arange(len(corners)), weights.argmax(axis=1)]
+        return labels, len(template.vertices), SurfacePoints(corners, weights)
 
     @cached_property
     def _surface(self) -> Surface:

@@ -46,7 +46,7 @@ class Raw(Descriptor, name="raw"):
 
     def compute(self, mesh: Mesh, frames: np.ndarray | None = None) -> np.ndarray:
         rings, rays = self.settings.rings, self.settings.rays
-        radius = self.settings.radius * np.sqrt(mesh.area)
+        radius = self.settings.radius * mesh.size
         start = sampling.surface_directions(mesh, frames[:, 0])
         undefined = ~np.isfinite(start)
         grid = np.where(undefined, 0.0, start)

@@ -21,7 +21,7 @@ class Shot(Descriptor, name="shot"):
         return shot.SECTORS * (self.settings.bins + 1)
 
     def compute(self, mesh: Mesh, frames: np.ndarray | None = None) -> np.ndarray:
-        radius = self.settings.radius * np.sqrt(mesh.area)
+        radius = self.settings.radius * mesh.size
         masses = mesh.vertex_areas if self.settings.by_area else None
         return shot.shot_descriptors(
             mesh.centred, mesh.vertex_normals, radius, self.settings.bins, masses=masses

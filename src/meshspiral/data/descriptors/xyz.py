@@ -18,4 +18,4 @@ class Xyz(Descriptor, name="xyz"):
     channels = 3
 
     def compute(self, mesh: Mesh, frames: np.ndarray | None = None) -> np.ndarray:
-        return (mesh.centred / np.sqrt(544 * mesh.area)).astype(np.float32)
+        return (mesh.centred / (np.sqrt(544) * mesh.size)).astype(np.float32)

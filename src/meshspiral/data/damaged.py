@@ -1,0 +1,89 @@
+"""Training shapes damaged as scans are: noise, holes, missing faces and missing parts."""
+
+from __future__ import annotations
+
+import sys
+
+import numpy as np
+
+from meshspiral.data.cache import code_version
+from meshspiral.data.settings import DamageSettings
+from meshspiral.data.shapes import Shape, ShapeSet, SurfacePoints
+from meshspiral.geometry import holes
+from meshspiral.geometry.digest import derived_seed
+from meshspiral.geometry.mesh import Mesh, in_use
+
+SMALLEST_HOLE = 0.02  # radius over the size of the shape
+KEPT = (0.35, 0.9)  # share of the vertices on the kept side of a cut
+LEAST = 0.25  # share of the vertices that must be left
+
+
+class Damaged(ShapeSet):
+    """The shapes of another data set, those to train on damaged; validation and test as they are.
+
+    The damage of a shape follows from the seed and its name. Labels remain those of the vertices
+    that are left. Small holes are then closed, as they are before a mesh is matched. A damaged mesh
+    knows the area of the complete surface, up to the settings' `size`.
+
+    Args:
+        base: The other data set.
+        settings: What damage.
+    """
+
+    def __init__(self, base: ShapeSet, settings: DamageSettings) -> None:
+        self.base, self._settings = base, settings
+        self.template, self.up, self.names = base.template, base.up, base.names
+        self._damaged = set(base.names["train"])
+
+    def prepare(self, names: list[str]) -> None:
+        self.base.prepare(names)
+
+    def load(self, name: str) -> Shape:
+        shape = self.base.load(name)
+        if name not in self._damaged:
+            return shape
+        rng = np.random.default_rng(derived_seed(self._settings.seed, "damage", name))
+        return damaged(shape, self._settings, rng)
+
+    def stamp(self, name: str) -> str | None:
+        stamp = self.base.stamp(name)
+        if stamp is None or name not in self._damaged:
+            return stamp
+        return f"{stamp}|{self._settings!r}|{code_version(holes, sys.modules[__name__])}"
+
+
+def damaged(shape: Shape, settings: DamageSettings, rng: np.random.Generator) -> Shape:
+    """A damaged copy of a shape, without the vertices that lose their faces."""
+    mesh = shape.mesh
+    noise = rng.uniform(0, settings.noise) * mesh.size
+    vertices = mesh.vertices + rng.normal(scale=noise, size=mesh.vertices.shape)
+    whole = (mesh.size * np.exp(rng.uniform(-settings.size, settings.size))) ** 2
+    faces = mesh.faces
+    if rng.random() < settings.share:
+        lost = np.zeros(len(vertices), dtype=bool)
+        if rng.random() < settings.cut:
+            lost |= beyond_plane(vertices, rng)
+        for _ in range(rng.integers(settings.holes + 1)):
+            radius = rng.uniform(min(SMALLEST_HOLE, settings.hole_radius), settings.hole_radius)
+            lost |= around_point(vertices, radius * mesh.size, rng)
+        kept = ~lost[faces].any(axis=1)
+        kept &= rng.random(len(faces)) >= rng.uniform(0, settings.missing)
+        if len(np.unique(faces[kept])) >= LEAST * len(vertices):
+            faces = faces[kept]
+    used, faces = in_use(faces)
+    points = shape.points and SurfacePoints(*(array[used] for array in shape.points))
+    left = holes.close_holes(Mesh(vertices[used], faces, mesh.name, float(whole)))
+    return Shape(left, shape.labels[used], shape.template_size, points)
+
+
+def beyond_plane(vertices: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """The vertices on one side of a random plane, bool [V]: 1 - KEPT of them."""
+    normal = rng.normal(size=3)
+    heights = vertices @ normal
+    return heights > np.quantile(heights, rng.uniform(*KEPT))
+
+
+def around_point(vertices: np.ndarray, radius: float, rng: np.random.Generator) -> np.ndarray:
+    """The vertices in a ball around a random one, bool [V]."""
+    centre = vertices[rng.integers(len(vertices))]
+    return np.linalg.norm(vertices - centre, axis=1) < radius

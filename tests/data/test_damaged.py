@@ -1,0 +1,104 @@
+"""Damage of training shapes: from the seed, with true labels, and known size."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from meshspiral.data.damaged import Damaged, damaged
+from meshspiral.data.datasets.bodies import Bodies
+from meshspiral.data.settings import DamageSettings
+from meshspiral.data.shapes import Shape, SurfacePoints
+from meshspiral.experiment.compose import compose_train
+from meshspiral.experiment.schema import ConfigError
+
+NONE = {"noise": 0.0, "share": 1.0, "cut": 0.0, "holes": 0, "hole_radius": 0.1, "missing": 0.0}
+BODIES = Bodies(1500)
+BODY = BODIES.load("s0_a_pose")
+
+
+def settings(**changes) -> DamageSettings:
+    return DamageSettings(**NONE | {"size": 0.0, "seed": 0} | changes)
+
+
+def apply(seed: int = 0, **changes) -> Shape:
+    return damaged(BODY, settings(**changes), np.random.default_rng(seed))
+
+
+def original_of(shape: Shape) -> np.ndarray:
+    """The vertex of BODY of each vertex: the labels, since BODY is registered."""
+    return shape.labels
+
+
+def test_without_any_damage_the_shape_is_the_same():
+    shape = apply()
+    np.testing.assert_array_equal(shape.mesh.faces, BODY.mesh.faces)
+    np.testing.assert_array_equal(shape.mesh.vertices, BODY.mesh.vertices)
+    assert shape.mesh.size == pytest.approx(BODY.mesh.size, rel=1e-12)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_a_cut_leaves_one_side_of_a_plane(seed):
+    shape = apply(seed, cut=1.0)
+    kept = original_of(shape)
+    assert 0.25 <= len(kept) / 1500 <= 0.91
+    np.testing.assert_array_equal(shape.mesh.vertices, BODY.mesh.vertices[kept])
+    assert shape.mesh.size == pytest.approx(BODY.mesh.size, rel=1e-12)
+    assert shape.mesh.area < 0.97 * BODY.mesh.area
+
+
+def test_holes_larger_than_those_closed_stay():
+    shape = apply(3, holes=3, hole_radius=0.3)
+    assert len(original_of(shape)) < 1500 and shape.mesh.area < BODY.mesh.area
+
+
+def test_missing_faces_are_closed_again_as_before_matching():
+    shapes = [apply(seed, missing=0.3) for seed in range(4)]
+    own = {tuple(sorted(face)) for face in BODY.mesh.faces.tolist()}
+    changed = 0
+    for shape in shapes:
+        assert shape.mesh.area == pytest.approx(BODY.mesh.area, rel=0.02)
+        found = original_of(shape)[shape.mesh.faces]
+        changed += len({tuple(sorted(face)) for face in found.tolist()} - own)
+    assert changed > 20  # holes of several faces get other faces
+
+
+def test_noise_moves_vertices_by_its_deviation():
+    moved = [
+        np.std(apply(seed, noise=0.01).mesh.vertices - BODY.mesh.vertices) / BODY.mesh.size
+        for seed in range(20)
+    ]
+    assert max(moved) <= 0.0101 and np.mean(moved) == pytest.approx(0.005, rel=0.4)
+
+
+def test_the_size_errs_by_at_most_its_share():
+    sizes = [apply(seed, size=0.1).mesh.size / BODY.mesh.size for seed in range(20)]
+    assert np.exp(-0.1) <= min(sizes) < 0.97 and 1.03 < max(sizes) <= np.exp(0.1)
+
+
+def test_points_on_the_template_stay_with_their_vertices():
+    points = SurfacePoints(np.tile(BODY.labels[:, None], 3), np.tile([1.0, 0, 0], (1500, 1)))
+    shape = damaged(
+        Shape(BODY.mesh, BODY.labels, 1500, points), settings(cut=1.0), np.random.default_rng(0)
+    )
+    np.testing.assert_array_equal(shape.points.corners[:, 0], shape.labels)
+
+
+def test_training_shapes_alone_are_damaged_and_always_alike():
+    shapes = Damaged(BODIES, settings(cut=1.0))
+    train, test = shapes.names["train"][0], shapes.names["test"][0]
+    assert len(shapes.load(test).labels) == 1500
+    first, again = shapes.load(train), shapes.load(train)
+    np.testing.assert_array_equal(first.mesh.vertices, again.mesh.vertices)
+    other = Damaged(BODIES, settings(cut=1.0, seed=1)).load(train)
+    assert len(other.labels) != len(first.labels) or (other.labels != first.labels).any()
+    assert shapes.stamp(train) != Damaged(BODIES, settings(cut=0.5)).stamp(train)
+    assert shapes.stamp(test) == BODIES.stamp(test)
+
+
+def test_the_config_group():
+    config = compose_train(["data/damage=scans", "data.damage.noise=0.001"])
+    assert config.data.damage.noise == 0.001
+    assert compose_train([]).data.damage is None
+    with pytest.raises(ConfigError, match="damage"):
+        compose_train(["data/damage=scans", "data.damage.share=2"])
