@@ -19,7 +19,7 @@ from meshspiral import Matcher, Mesh, open_scan, scan
 from meshspiral.data.datasets.bodies import Bodies
 from meshspiral.experiment.run_folder import BEST, RunError
 from meshspiral.geometry.mesh import MeshError
-from meshspiral.matching.matcher import Labels, nearest_vertices
+from meshspiral.matching.matcher import FACTORS, Labels, nearest_vertices, normalize
 from tests.conftest import toy_shapes
 from tests.damage import damaged_file
 from tests.helpers import clone_environment
@@ -151,6 +151,47 @@ def test_confidence_after_smoothing_is_that_of_the_refined_label(trained):
     assert 0 < same.mean() < 1
     np.testing.assert_allclose(smooth.confidence[same], raw.confidence[same], rtol=1e-4)
     assert (smooth.confidence[~same] <= raw.confidence[~same]).all()
+
+
+def test_only_zoomout_needs_a_complete_surface(trained):
+    half = scan_of(SOURCE, faces=SOURCE.faces[: len(SOURCE.faces) // 2])
+    found = Matcher.load(trained, refine="crf").label(half)
+    assert (found.template >= 0).sum() == len(half.mesh.vertices)
+
+
+# ------------------------------------------------------------------------------------------ size
+
+
+def upper_half() -> Mesh:
+    keep = SOURCE.vertices[:, 2] > np.median(SOURCE.vertices[:, 2])
+    return SOURCE.with_faces(SOURCE.faces[keep[SOURCE.faces].all(axis=1)])
+
+
+def test_with_a_scale_radii_are_those_of_the_template(trained):
+    size = TEMPLATE.size
+    for scale in (1.0, 0.001):
+        sized = Matcher.load(trained, scale=scale)._sized(upper_half(), lambda stage: None)
+        assert sized.size == pytest.approx(size / scale)
+    sized = Matcher.load(trained, scale=size / SOURCE.size)._sized(SOURCE, lambda stage: None)
+    np.testing.assert_allclose(normalize(sized).vertices, normalize(SOURCE).vertices)
+
+
+def test_the_size_of_an_open_surface_is_that_of_which_the_network_is_surest(matcher, monkeypatch):
+    half, stages, asked = upper_half(), [], []
+
+    def probability(mesh):
+        asked.append(np.sqrt(1 / mesh.area))  # the size of the whole over that of the part
+        return np.full(len(mesh.vertices), np.exp(-((asked[-1] - 1.44) ** 2)))
+
+    monkeypatch.setattr(matcher, "_probability", probability)
+    sized = matcher._sized(half, stages.append)
+    assert sized.size / half.size == pytest.approx(1.45) and stages == ["size"]
+    np.testing.assert_allclose(asked, FACTORS, rtol=1e-6)
+
+
+def test_a_surface_without_large_holes_has_its_own_size(matcher):
+    for mesh in (SOURCE, SOURCE.with_faces(SOURCE.faces[1:])):
+        assert matcher._sized(mesh, pytest.fail) is mesh
 
 
 def test_an_isolated_vertex_gets_no_label_and_changes_no_other(matcher):

@@ -185,7 +185,15 @@ class MatchConfig(Settings):
     resample: bool | None = Field(
         description="predict at the density of the training meshes; null: only if it is far off"
     )
-    smooth: bool = Field(description="refine the map by ZoomOut, for complete surfaces")
+    refine: Literal["zoomout", "crf"] | None = Field(
+        description="refine the labels: zoomout, for complete surfaces; crf, for any; null: not"
+    )
+    smooth: bool = Field(description="the same as refine=zoomout")
+    scale: float | None = Field(
+        gt=0,
+        description="metres in a unit of the meshes, 0.001 for millimetres; null: radii follow "
+        "from the surface area, or from the size at which the network is surest",
+    )
     transfer: Text | None = Field(
         description="carry color, uv, or a .npy array [V, ...] of the target to the source"
     )
@@ -205,6 +213,8 @@ class MatchConfig(Settings):
     def _complete(self) -> Self:
         if (self.source is None) == (self.sources is None):
             raise ValueError("give source=, a mesh, or sources=, a pattern such as 'scans/*.ply'")
+        if self.smooth and self.refine not in (None, "zoomout"):
+            raise ValueError(f"smooth=true is refine=zoomout; it excludes refine={self.refine}")
         if self.transfer and not self.target:
             raise ValueError("transfer= carries values of the target to the source; give target=")
         return self

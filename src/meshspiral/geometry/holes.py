@@ -31,7 +31,7 @@ def close_holes(mesh: Mesh, radius: float = HOLE) -> Mesh:
         return mesh
     count = len(mesh.vertices)
     edges = directed_edges(mesh.faces).astype(np.int64)
-    rim = np.flatnonzero(~np.isin(edges[:, 1] * count + edges[:, 0], edges @ [count, 1]))
+    rim = _boundary(edges, count)
     if not len(rim):
         return mesh
     taken = set((edges.min(axis=1) * count + edges.max(axis=1)).tolist())
@@ -57,6 +57,18 @@ def close_holes(mesh: Mesh, radius: float = HOLE) -> Mesh:
             taken.update(keys[corners, np.roll(corners, -1, axis=1)].ravel().tolist())
             added.append(loop[corners])
     return mesh.with_faces(np.concatenate([mesh.faces, *added])) if added else mesh
+
+
+def boundary_length(mesh: Mesh) -> float:
+    """The length of all boundaries, in the mesh's unit."""
+    edges = directed_edges(mesh.faces).astype(np.int64)
+    start, tip = edges[_boundary(edges, len(mesh.vertices))].T
+    return float(np.linalg.norm(mesh.vertices[start] - mesh.vertices[tip], axis=1).sum())
+
+
+def _boundary(edges: np.ndarray, count: int) -> np.ndarray:
+    """The edges with a face on one side only, as rows of `edges`, int64 [E, 2], directed."""
+    return np.flatnonzero(~np.isin(edges[:, 1] * count + edges[:, 0], edges @ [count, 1]))
 
 
 def boundary_loops(faces: np.ndarray) -> list[np.ndarray]:

@@ -34,14 +34,30 @@ class Resampled(NamedTuple):
 
 
 def resample(mesh: Mesh, vertices: int) -> Resampled:
+    """Resample a surface, and find where on it the vertices of the source lie.
+
+    Args:
+        mesh, vertices: As for `resampled`, whose errors it raises.
+    """
+    coarse = resampled(mesh, vertices)
+    projections = [
+        closest_points(
+            coarse,
+            mesh.vertices[start : start + POINTS],
+            mesh.vertex_normals[start : start + POINTS],
+        )[:2]
+        for start in range(0, len(mesh.vertices), POINTS)
+    ]
+    face, weights = (np.concatenate(column) for column in zip(*projections, strict=True))
+    return Resampled(coarse, coarse.faces[face].astype(np.int64), weights)
+
+
+def resampled(mesh: Mesh, vertices: int) -> Mesh:
     """Resample a surface to approximately a given number of vertices.
 
     Args:
         mesh: The source. Its isolated vertices do not contribute to the result.
         vertices: The number of vertices wanted.
-
-    Returns:
-        The resampled surface, and where on it the vertices of the source lie.
 
     Raises:
         MeshError: The mesh has no face, or nothing of the surface would be left.
@@ -68,14 +84,4 @@ def resample(mesh: Mesh, vertices: int) -> Resampled:
             f"{mesh.name}: nothing is left of the surface when it is resampled to "
             f"{vertices} vertices"
         )
-    resampled = Mesh(points[used], faces, mesh.name, mesh.whole)
-    projections = [
-        closest_points(
-            resampled,
-            mesh.vertices[start : start + POINTS],
-            mesh.vertex_normals[start : start + POINTS],
-        )[:2]
-        for start in range(0, len(mesh.vertices), POINTS)
-    ]
-    face, weights = (np.concatenate(column) for column in zip(*projections, strict=True))
-    return Resampled(resampled, resampled.faces[face].astype(np.int64), weights)
+    return Mesh(points[used], faces, mesh.name, mesh.whole)

@@ -47,8 +47,8 @@ class Distributions(NamedTuple):
         return torch.softmax(scores, dim=1).cpu().numpy()
 
 
-def near_vertices(template: Mesh) -> csr_array:
-    """Pairs of template vertices at most RADIUS apart.
+def near_vertices(template: Mesh, radius: float = RADIUS) -> csr_array:
+    """Pairs of template vertices at most a radius apart, which is given over sqrt(area).
 
     The distance is the straight one, which on a surface differs little at this length. Vertices
     that are further apart along edges than DETOUR are left out.
@@ -56,7 +56,7 @@ def near_vertices(template: Mesh) -> csr_array:
     Returns:
         float32 [K, K], 1 for each pair, also for a vertex and itself.
     """
-    size, radius = len(template.vertices), RADIUS * np.sqrt(template.area)
+    size, radius = len(template.vertices), radius * np.sqrt(template.area)
     start, tip = template.faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2).T
     lengths = np.linalg.norm(template.vertices[start] - template.vertices[tip], axis=1)
     keys, first = np.unique(start.astype(np.int64) * size + tip, return_index=True)

@@ -84,6 +84,8 @@ class MatchJob:
             accelerator=self.config.accelerator,
             resampled=self.config.resample,
             smooth=self.config.smooth,
+            refine=self.config.refine,
+            scale=self.config.scale,
         )
 
     @cached_property
@@ -156,7 +158,8 @@ class MatchJob:
     def _shared_key(self) -> str:
         config = self.config
         files = [str(Path(config.run or BUNDLED_RUN) / BEST), *self.inputs]
-        settings = config.repair, config.resample, config.smooth, config.transfer, self.render
+        settings = config.repair, config.resample, config.transfer, self.render
+        settings += config.refine, config.smooth, config.scale
         return digest(*map(_content, files), *settings, CONTENT)
 
 

@@ -24,8 +24,9 @@ from meshspiral.data.tensors import described_tensors, neighbourhood_tensors
 from meshspiral.experiment.run_folder import BEST
 from meshspiral.experiment.schema import TrainConfig
 from meshspiral.geometry.barycentric import interpolate
+from meshspiral.geometry.holes import HOLE, boundary_length
 from meshspiral.geometry.mesh import Mesh
-from meshspiral.geometry.resample import resample
+from meshspiral.geometry.resample import resample, resampled
 from meshspiral.geometry.zoomout import TO, eigenfunctions, zoomout
 from meshspiral.matching.confidence import (
     Distributions,
@@ -33,11 +34,14 @@ from meshspiral.matching.confidence import (
     near_confidence,
     near_vertices,
 )
+from meshspiral.matching.mean_field import MeanField
 from meshspiral.training.checkpoints import BUNDLED_RUN, config_of, read_checkpoint, template_of
 from meshspiral.training.predictor import Predictor
 
-MESH_STAGES = ("resampling", "descriptors", "neighbourhoods", "network", "refinement")
+MESH_STAGES = ("size", "resampling", "descriptors", "neighbourhoods", "network", "refinement")
+REFINEMENTS = ("zoomout", "crf")
 Report = Callable[[str], None]  # is told each stage when it begins; not every mesh has all
+FACTORS = (1.0, 1.1, 1.2, 1.3, 1.45, 1.6, 1.8, 2.1, 2.5)  # tried for the size of an open surface
 NEAR = 5.0  # mean edges of the template; labels further apart are not interpolated
 
 
@@ -90,7 +94,13 @@ class Matcher:
         resampled: True: resample every mesh to the density of the training meshes, and interpolate
             the labels. False: never. None: only a mesh with so many more or fewer vertices that it
             is outside the `density_range` of the network's neighbourhood.
-        smooth: Refine the labels of every mesh by ZoomOut (Melzi et al. 2019).
+        smooth: The same as refine="zoomout".
+        refine: How to refine the labels of every mesh, one of REFINEMENTS: "zoomout" for complete
+            surfaces (Melzi et al. 2019), or "crf", which surfaces with holes can have too, see
+            `meshspiral.matching.mean_field`. None: not.
+        scale: Length of one unit of the meshes in the template's unit; the bundled template is in
+            metres. Radii are then those of a body of the template's size. None: they follow from
+            the surface area; if a mesh has large holes, the size is sought, see `surest_size`.
 
     Attributes:
         template: The mesh whose vertices and points are the labels.
@@ -108,11 +118,14 @@ class Matcher:
         accelerator: str = "cpu",
         resampled: bool | None = None,
         smooth: bool = False,
+        refine: str | None = None,
+        scale: float | None = None,
     ):
         self.template = template_of(saved)
         self.up = saved["up"]
         self._training_size = int(saved["resolution"])  # vertices of a training mesh
-        self._resampled, self._smooth = resampled, smooth
+        self._resampled, self._scale = resampled, scale
+        self._refine = "zoomout" if smooth else refine
         self._features = Features.of(config.data)
         self._predictor = Predictor(saved, config, accelerator)
 
@@ -123,7 +136,7 @@ class Matcher:
         Args:
             run: The run folder; only checkpoints/best.ckpt is read. None: the bundled network,
                 trained on complete human bodies.
-            **options: `accelerator`, `resampled` and `smooth` of the class.
+            **options: `accelerator`, `resampled`, `smooth`, `refine` and `scale` of the class.
 
         Raises:
             RunError: The checkpoint is missing or damaged, has no template, or needs a plugin.
@@ -158,7 +171,7 @@ class Matcher:
             MeshError: The mesh cannot be described, resampled or smoothed.
         """
         report = report or (lambda stage: None)
-        mesh = normalize(scan.mesh)
+        mesh = normalize(self._sized(scan.mesh, report))
         if self._needs_resampling(len(mesh.vertices)):
             report("resampling")
             coarse = resample(mesh, self._training_size)
@@ -202,6 +215,46 @@ class Matcher:
         """
         return map_confidence(source, target, match, self._near_vertices)
 
+    def _sized(self, mesh: Mesh, report: Report) -> Mesh:
+        """The mesh with the area of the complete surface, if it is known or can be found."""
+        if self._scale is not None:
+            whole = (self.template.size / self._scale) ** 2
+            return Mesh(mesh.vertices, mesh.faces, mesh.name, whole)
+        if boundary_length(mesh) <= 2 * np.pi * HOLE * mesh.size:
+            return mesh
+        report("size")
+        whole = (self.surest_size(mesh) * mesh.size) ** 2
+        return Mesh(mesh.vertices, mesh.faces, mesh.name, whole)
+
+    def surest_size(self, mesh: Mesh) -> float:
+        """The size of the complete surface at which the network is surest of its labels.
+
+        The mean probability of the labels decides, on the mesh at the density of training.
+
+        Args:
+            mesh: A part of a surface.
+
+        Returns:
+            The size of the complete surface over that of the mesh, one of FACTORS.
+
+        Raises:
+            MeshError: The mesh cannot be described or resampled.
+        """
+        mesh = normalize(mesh)
+        if len(mesh.vertices) > self._training_size:
+            mesh = resampled(mesh, self._training_size)
+        area, sure = mesh.area, []
+        for factor in FACTORS:
+            sized = Mesh(mesh.vertices, mesh.faces, mesh.name, factor**2 * area)
+            probability = self._probability(normalize(sized))
+            sure.append(np.average(probability, weights=mesh.vertex_areas))
+        return FACTORS[int(np.argmax(sure))]
+
+    def _probability(self, mesh: Mesh) -> np.ndarray:
+        """The probability of the label of every vertex, float [W]."""
+        embedding = self._embed(mesh, lambda stage: None)
+        return self._predictor.predict(embedding).probability.float().cpu().numpy()
+
     def _needs_resampling(self, vertices: int) -> bool:
         if self._resampled is not None:
             return self._resampled
@@ -219,6 +272,22 @@ class Matcher:
             Vertices of the template, int64 [W], their probabilities, float32 [W], and the input of
             the network's last layer, [W, C].
         """
+        embedding = self._embed(mesh, report)
+        prediction = self._predictor.predict(embedding)
+        template, confidence = prediction.classes.cpu().numpy(), prediction.probability
+        if self._refine is not None:
+            report("refinement")
+            if self._refine == "zoomout":
+                template = zoomout(*eigenfunctions(mesh, TO), self._eigenfunctions, template)
+            else:
+                weight, bias = self._predictor.head
+                scores = torch.addmm(bias, embedding.to(weight.dtype), weight.T)
+                template = self._mean_field(torch.log_softmax(scores, 1).cpu().numpy(), mesh)
+            confidence = self._predictor.predict(embedding, torch.from_numpy(template)).of_label
+        return template, confidence.float().cpu().numpy(), embedding
+
+    def _embed(self, mesh: Mesh, report: Report) -> torch.Tensor:
+        """The input of the network's last layer, [W, C], for each vertex of a mesh."""
         report("descriptors")
         described = [compute_task(descriptor_task(mesh, d)) for d in self._features.descriptors]
         batch = described_tensors(described, mesh, self._features)
@@ -228,14 +297,7 @@ class Matcher:
         batch |= neighbourhood_tensors(mesh, neighbourhood, arrays)
         batch["index"] = 0
         report("network")
-        embedding = self._predictor.embed(batch, "evaluation")
-        prediction = self._predictor.predict(embedding)
-        template, confidence = prediction.classes.cpu().numpy(), prediction.probability
-        if self._smooth:
-            report("refinement")
-            template = zoomout(*eigenfunctions(mesh, TO), self._eigenfunctions, template)
-            confidence = self._predictor.predict(embedding, torch.from_numpy(template)).of_label
-        return template, confidence.float().cpu().numpy(), embedding
+        return self._predictor.embed(batch, "evaluation")
 
     def _interpolate(
         self, corners: np.ndarray, weights: np.ndarray, nearest: np.ndarray
@@ -256,6 +318,10 @@ class Matcher:
         distances = np.linalg.norm(vertices[corners] - vertices[nearest][:, None], axis=2)
         weights = np.where(distances < self._near, weights, 0.0)
         return interpolate(vertices, corners, weights) / weights.sum(1, keepdims=True)
+
+    @cached_property
+    def _mean_field(self) -> MeanField:
+        return MeanField(self.template)
 
     @cached_property
     def _near(self) -> float:

@@ -1,0 +1,72 @@
+"""Refinement by the labels of neighbours, against the sums of its definition."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from meshspiral import Matcher, scan
+from meshspiral.data.datasets.bodies import Bodies
+from meshspiral.matching import mean_field
+from meshspiral.matching.mean_field import REACH, STRENGTH, WIDTH, MeanField, neighbour_mean
+from tests.meshes import bumpy_sphere, punctured
+
+SPHERE = bumpy_sphere(subdivisions=3)
+
+
+def likely(labels: np.ndarray, wrong: np.ndarray, template: int) -> np.ndarray:
+    """Log-probabilities that prefer `labels`, but at `wrong` the opposite label a little."""
+    scores = np.zeros((len(labels), template), dtype=np.float32)
+    scores[np.arange(len(labels)), labels] = 9.0
+    scores[wrong, (labels[wrong] + template // 2) % template] = 9.5
+    return torch.log_softmax(torch.from_numpy(scores), 1).numpy()
+
+
+def test_the_mean_over_the_one_ring():
+    mean = neighbour_mean(SPHERE)
+    values = np.random.default_rng(0).normal(size=len(SPHERE.vertices))
+    for vertex in (0, 17, 200):
+        ring = np.unique(SPHERE.faces[(SPHERE.faces == vertex).any(axis=1)])
+        expected = values[ring[ring != vertex]].mean()
+        assert (mean @ values)[vertex] == pytest.approx(expected, rel=1e-5)
+
+
+def test_one_step_is_that_of_the_definition(monkeypatch):
+    monkeypatch.setattr(mean_field, "STEPS", 1)
+    rng = np.random.default_rng(1)
+    size = len(SPHERE.vertices)
+    scores = torch.from_numpy(rng.normal(size=(size, size)).astype(np.float32) * 4)
+    log_probability = torch.log_softmax(scores, 1).numpy()
+    found = MeanField(SPHERE)(log_probability, SPHERE)
+    apart = np.linalg.norm(SPHERE.vertices[:, None] - SPHERE.vertices, axis=2) / SPHERE.size
+    kernel = np.where(apart <= REACH * WIDTH, np.exp(-((apart / WIDTH) ** 2) / 2), 0)
+    field = neighbour_mean(SPHERE) @ np.exp(log_probability)
+    expected = (log_probability + STRENGTH * field @ kernel).argmax(axis=1)
+    assert (found == expected).mean() > 0.999  # float32 may decide between equals otherwise
+
+
+@pytest.mark.parametrize("mesh", [SPHERE, punctured(SPHERE, 0.1)])
+def test_scattered_errors_take_the_labels_of_their_neighbours(mesh):
+    labels = np.arange(len(SPHERE.vertices))
+    wrong = np.random.default_rng(0).choice(labels, 60, replace=False)
+    faces = np.bincount(mesh.faces.ravel(), minlength=len(labels))[wrong]
+    log_probability = likely(labels, wrong, len(labels))
+    assert (log_probability.argmax(axis=1)[wrong] != wrong).all()
+    found = MeanField(SPHERE)(log_probability, mesh)
+    apart = np.linalg.norm(SPHERE.vertices[found] - SPHERE.vertices, axis=1) / SPHERE.size
+    assert (apart[wrong][faces > 2] < 0.1).mean() > 0.95
+    right = np.setdiff1d(labels, wrong)
+    assert (found[right] == right).mean() > 0.99
+
+
+def test_the_bundled_network_errs_less_with_it():
+    bodies = Bodies(1500)
+    mesh = bodies.load("s9_squat").mesh
+    place = bodies.template.vertices
+    errors = []
+    for refine in (None, "crf"):
+        labels = Matcher.load(refine=refine).label(scan(mesh.vertices, mesh.faces, "a"))
+        errors.append(np.linalg.norm(place[labels.template] - place, axis=1).mean())
+        assert labels.confidence.min() >= 0 and labels.confidence.max() <= 1
+    assert errors[1] < errors[0]
