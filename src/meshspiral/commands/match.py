@@ -27,6 +27,7 @@ CONTENTS = {
     "source.ply target.ply": "the meshes; corresponding points have equal colours",
     "transferred.npy transferred.ply transferred.obj": "the target's values, on the source",
     "correspondence.png confidence.png": "renders from the front and the back",
+    "view.html": "both meshes to turn and compare; open it in a browser",
 }
 
 log = logging.getLogger(__name__)

@@ -16,6 +16,7 @@ from meshspiral.geometry.mesh import MeshError
 from meshspiral.matching.job import FileMatch, MatchJob
 from meshspiral.matching.pictures import draw_pictures, own_colors
 from meshspiral.matching.transfer import transfer
+from meshspiral.matching.viewer import view_html
 from meshspiral.viz.colors import GREY, point_colors
 
 RESULT = "match.npz"
@@ -31,6 +32,7 @@ SOURCE_FILES = (
     "transferred.obj",
     "correspondence.png",
     "confidence.png",
+    "view.html",
 )
 
 
@@ -65,6 +67,10 @@ def write_match(job: MatchJob, match: FileMatch, folder: Path) -> None:
     if job.transfer_values is not None:
         values = transfer(job.transfer_values, match.map, 0)
         write_transferred(folder, scan, values, job.config.transfer)
+    if job.render or not job.config.sources:
+        values = job.transfer_values if job.config.transfer == "color" else None
+        page = view_html(match, template, job.matcher.up, values)
+        write_file(folder / "view.html", page)
     if job.render:
         required = job.config.picture is True
         draw_pictures(folder, match, template, job.matcher.up, required)

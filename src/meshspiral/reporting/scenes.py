@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import base64
 import os
 from pathlib import Path
 from typing import Any
@@ -18,6 +17,7 @@ from meshspiral.geometry.digest import digest
 from meshspiral.geometry.mesh import Mesh, MeshError
 from meshspiral.reporting.runs import Run
 from meshspiral.viz.colors import MOST_ERROR, template_colors
+from meshspiral.viz.packing import pack_array
 from meshspiral.viz.render import upright
 
 
@@ -100,9 +100,3 @@ def scenes_of(runs: list[Run], count: int) -> tuple[Scenes, list[str]]:
         except (DataError, MeshError, OSError) as error:
             notes.append(f"{run.folder}: cannot show its shapes ({error})")
     return scenes, notes
-
-
-def pack_array(array: np.ndarray, dtype: type) -> str:
-    """The entries of an array row by row, little-endian, in base64."""
-    little = np.ascontiguousarray(array, dtype=np.dtype(dtype).newbyteorder("<"))
-    return base64.b64encode(little.tobytes()).decode()
