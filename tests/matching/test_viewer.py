@@ -154,9 +154,7 @@ def test_the_mark_follows_the_pointer(matcher, match, tmp_path):
         page.mouse.move(x + 80, y + 20, steps=4)
         page.mouse.up()
         page.wait_for_timeout(1000)
-        one, other = (
-            page.evaluate(f"{camera}.{scene}.camera.eye") for scene in ("scene", "scene2")
-        )
+        eyes = [page.evaluate(f"{camera}.{scene}.camera.eye") for scene in ("scene", "scene2")]
         assert eyes[0] == eyes[1] and eyes[0]["x"] != 0
         page.screenshot(path=tmp_path / "view.png")
         browser.close()

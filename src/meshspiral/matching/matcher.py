@@ -127,7 +127,7 @@ class Matcher:
         self._resampled, self._scale = resampled, scale
         self._refine = "zoomout" if smooth else refine
         self._features = Features.of(config.data)
-        self._predictor = Predictor(saved, config, accelerator)
+        self._predictor = Predictor(saved, config, accelerator, calibrated=True)
 
     @classmethod
     def load(cls, run: str | Path | None = None, **options: Any) -> Matcher:

@@ -18,6 +18,7 @@ from meshspiral.experiment.schema import OptimSettings, TrainConfig, read_stored
 from meshspiral.geometry.digest import derived_seed
 from meshspiral.neighbourhoods import Neighbourhood
 from meshspiral.neighbourhoods.base import Batch
+from meshspiral.nn.calibration import fit_temperature
 from meshspiral.nn.loss import Points, Prediction, SoftLabels, linear_cross_entropy, predict
 from meshspiral.nn.networks import Network
 
@@ -55,6 +56,7 @@ def rate_factor(optim: OptimSettings, step: int, steps: int) -> float:
     return 0.5 * (1 + math.cos(math.pi * (step - warmup) / max(1, steps - warmup)))
 
 
+SAMPLES = 256  # of each validation mesh, to fit the temperature
 CHECK_EVERY = 10  # steps between two checks of the loss on a GPU, each of which waits for it
 
 
@@ -71,6 +73,8 @@ class Correspondence(L.LightningModule):
             metrics.json. Checkpoints contain those of validation.
         curves: Likewise the share of correct matches over `THRESHOLDS`.
         results: Likewise the prediction and the errors of each mesh, by its index.
+        temperature: By which scores are divided for calibrated probabilities, fitted to a sample of
+            each validation mesh in the latest validation. Checkpoints contain it.
     """
 
     def __init__(self, config: dict[str, Any], in_features: int, num_classes: int):
@@ -85,6 +89,7 @@ class Correspondence(L.LightningModule):
         self.metrics: dict[str, dict[str, float]] = {}
         self.curves: dict[str, np.ndarray] = {}
         self.results: dict[str, dict[int, Result]] = {}
+        self.temperature = 1.0
 
     def setup(self, stage: str) -> None:
         self.distances = self.trainer.datamodule.reference
@@ -141,7 +146,12 @@ class Correspondence(L.LightningModule):
         return predict(self.net.embed_batch(batch), head.weight, head.bias, batch.get("labels"))
 
     def _evaluate(self, split: str, batch: Batch) -> None:
-        found = self.predict(batch)
+        head, labels = self.net.head, batch["labels"]
+        x = self.net.embed_batch(batch)
+        found = predict(x, head.weight, head.bias, labels)
+        if split == "val":
+            step = max(1, len(labels) // SAMPLES)
+            self._samples.append((x[::step], labels[::step]))
         predicted = found.classes.cpu().numpy()
         self.log(f"{split}/loss", found.loss, batch_size=1, sync_dist=True)
         result = result_of(predicted, batch, self.distances)
@@ -150,12 +160,18 @@ class Correspondence(L.LightningModule):
 
     def on_validation_epoch_start(self) -> None:
         self.results["val"] = {}
+        self._samples: list[tuple[Tensor, Tensor]] = []
 
     def on_test_epoch_start(self) -> None:
         self.results["test"] = {}
 
     def on_validation_epoch_end(self) -> None:
         self._report("val")
+        head = self.net.head
+        x, labels = (torch.cat(each) for each in zip(*self._samples, strict=True))
+        self._samples = []
+        scores = torch.addmm(head.bias, x.to(head.weight.dtype), head.weight.T)
+        self.temperature = fit_temperature(scores, labels)
 
     def on_test_epoch_end(self) -> None:
         self._report("test")
@@ -183,6 +199,7 @@ class Correspondence(L.LightningModule):
         checkpoint["up"] = data.shapes.up
         checkpoint["resolution"] = data.resolution
         checkpoint["processes"] = self.trainer.world_size
+        checkpoint["temperature"] = self.temperature
         if "val" in self.curves:
             checkpoint["validation"] = (self.metrics["val"], torch.from_numpy(self.curves["val"]))
 

@@ -25,6 +25,7 @@ class Predictor:
         config: Its config, from `config_of`; settings of the data set may differ.
         accelerator: "cpu" or "gpu".
         votes: Number of draws of the neighbourhoods; the mean of their log-probabilities decides.
+        calibrated: Divide scores by the checkpoint's temperature, if it has one.
 
     Raises:
         RunError: The weights do not fit the config.
@@ -32,7 +33,12 @@ class Predictor:
     """
 
     def __init__(
-        self, saved: dict[str, Any], config: TrainConfig, accelerator: str = "cpu", votes: int = 1
+        self,
+        saved: dict[str, Any],
+        config: TrainConfig,
+        accelerator: str = "cpu",
+        votes: int = 1,
+        calibrated: bool = False,
     ):
         self.device = device_of(accelerator)
         self.precision = choose_precision(config.trainer.precision, accelerator)
@@ -46,6 +52,7 @@ class Predictor:
             raise RunError("the checkpoint's weights do not fit its config") from error
         dtype = torch.float64 if self.precision == "64-true" else torch.float32
         self.module.to(self.device, dtype).eval()
+        self._temperature = saved.get("temperature", 1.0) if calibrated else 1.0
 
     def __call__(self, batch: Batch, purpose: str) -> Prediction:
         """Predict a vertex of the template for each vertex of a mesh.
@@ -89,6 +96,6 @@ class Predictor:
 
     @property
     def head(self) -> tuple[Tensor, Tensor]:
-        """Weight [K, C] and bias [K] of the last layer."""
+        """Weight [K, C] and bias [K] of the last layer, over the temperature."""
         head = self.module.net.head
-        return head.weight.detach(), head.bias.detach()
+        return head.weight.detach() / self._temperature, head.bias.detach() / self._temperature
