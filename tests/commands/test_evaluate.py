@@ -28,7 +28,7 @@ from tests.helpers import composed, run
 from tests.neighbourhoods.made import spiral
 
 SEED = 3
-REMESH = {"policy": "mixed", "vertices": 120, "copies": 1}
+REMESH = {"policy": "mixed", "vertices": 120, "copies": 1, "shared": None}
 FOLDER = {
     "name": "folder",
     "template": "template.ply",
@@ -264,7 +264,9 @@ def test_plots_of_an_earlier_evaluation_are_removed(cli, moved):
 )
 def test_requested_data_settings_replace_those_of_the_run(toy_overrides, requested, expected):
     own = ["data.root=here", "data.labels=x", "data.shuffle_vertices=true"]
-    own += [f"+data.remesh.{key}={value}" for key, value in REMESH.items()]
+    own += [
+        f"+data.remesh.{key}={'null' if value is None else value}" for key, value in REMESH.items()
+    ]
     trained = composed([*toy_overrides, *own])
     config = config_on_data(trained, requested)
     data = config.data.model_dump()

@@ -219,7 +219,7 @@ def test_help_shows_groups_settings_and_three_examples(cli):
         "data.raw.rings number of rings of the polar grid",
         "model.metric read metric information: distance and angle (conv, fcs, lstm)",
         "neighbourhood.rays number of rays of the polar grid, even (patch)",
-        "data.vertices vertices of the template and the bodies (bodies, anny)",
+        "data.vertices vertices of the template and the bodies (bodies)",
     ):
         assert line in lines
     assert len([line for line in lines if line.startswith("python -m")]) >= 3
