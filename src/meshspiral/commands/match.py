@@ -27,6 +27,9 @@ CONTENTS = {
     "source.ply target.ply": "the meshes; corresponding points have equal colours",
     "transferred.npy transferred.ply transferred.obj": "the target's values, on the source",
     "correspondence.png confidence.png": "renders from the front and the back",
+    "dense.npz dense.csv": "for each source vertex a point in a face of the target",
+    "registered.ply": "the source with the vertices and faces of the template",
+    "morph.glb": "the source, turning into the target and back",
     "view.html": "both meshes to turn and compare; open it in a browser",
 }
 

@@ -197,6 +197,13 @@ class MatchConfig(Settings):
     transfer: Text | None = Field(
         description="carry color, uv, or a .npy array [V, ...] of the target to the source"
     )
+    export: Annotated[
+        list[Literal["dense", "registered", "morph"]],
+        BeforeValidator(lambda v: [v] if isinstance(v, str) else v or []),
+    ] = Field(
+        description="also write, one or a list: dense, points in the target's faces as NumPy and "
+        "CSV; registered, the source with the template's connectivity; morph, an animated GLB"
+    )
     picture: bool | None = Field(description="render; null: with source= yes, with sources= no")
     accelerator: Accelerator
     workers: int | None = Field(ge=1, description="processes, with sources=; null: one per core")
@@ -213,6 +220,9 @@ class MatchConfig(Settings):
     def _complete(self) -> Self:
         if (self.source is None) == (self.sources is None):
             raise ValueError("give source=, a mesh, or sources=, a pattern such as 'scans/*.ply'")
+        needy = sorted({"dense", "morph"} & set(self.export))
+        if needy and not self.target:
+            raise ValueError(f"export={needy[0]} relates to the target; give target=")
         if self.smooth and self.refine not in (None, "zoomout"):
             raise ValueError(f"smooth=true is refine=zoomout; it excludes refine={self.refine}")
         if self.transfer and not self.target:

@@ -159,7 +159,7 @@ class MatchJob:
         config = self.config
         files = [str(Path(config.run or BUNDLED_RUN) / BEST), *self.inputs]
         settings = config.repair, config.resample, config.transfer, self.render
-        settings += config.refine, config.smooth, config.scale
+        settings += config.refine, config.smooth, config.scale, str(config.export)
         return digest(*map(_content, files), *settings, CONTENT)
 
 

@@ -13,6 +13,7 @@ from meshspiral.data.files import write_arrays, write_file
 from meshspiral.data.scans import Scan
 from meshspiral.data.shapes import DataError
 from meshspiral.geometry.mesh import MeshError
+from meshspiral.matching.export import EXPORT_FILES, write_exports
 from meshspiral.matching.job import FileMatch, MatchJob
 from meshspiral.matching.pictures import draw_pictures, own_colors
 from meshspiral.matching.transfer import transfer
@@ -33,6 +34,7 @@ SOURCE_FILES = (
     "correspondence.png",
     "confidence.png",
     "view.html",
+    *EXPORT_FILES,
 )
 
 
@@ -67,6 +69,7 @@ def write_match(job: MatchJob, match: FileMatch, folder: Path) -> None:
     if job.transfer_values is not None:
         values = transfer(job.transfer_values, match.map, 0)
         write_transferred(folder, scan, values, job.config.transfer)
+    write_exports(job.config.export, match, template, job.matcher.up, folder)
     if job.render or not job.config.sources:
         values = job.transfer_values if job.config.transfer == "color" else None
         page = view_html(match, template, job.matcher.up, values)
