@@ -119,6 +119,7 @@ def match_many(config: MatchConfig) -> Path:
         DataError: A mesh was refused, or a worker process was killed.
     """
     from meshspiral.matching.batch import find_sources, match_batch
+    from meshspiral.matching.index import INDEX, write_index
     from meshspiral.matching.job import MatchJob
     from meshspiral.matching.writing import TARGET_FILES, delete_files, write_target
 
@@ -140,6 +141,8 @@ def match_many(config: MatchConfig) -> Path:
         result.repaired,
         len(result.refused),
     )
+    write_index(folder, sources, result.refused.values())
+    log.info("All of them: %s", folder / INDEX)
     delete_files(folder, (REFUSED,))
     if result.refused:
         reasons = [result.refused[path] for path in sorted(result.refused)]
