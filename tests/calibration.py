@@ -4,7 +4,8 @@
 
 Matches that many of the 20 test bodies, each to another one, with the bundled network or that of a
 run. For ranges of a confidence, prints the share of vertices that are right, and in brackets the
-share of all vertices that are in the range. A label is right within 0.05 sqrt(area) of the true
+share of all vertices that are in the range; then the share of all that are right, and the expected
+calibration error. A label is right within 0.05 sqrt(area) of the true
 point of the template, and a match if its target vertex belongs there.
 """
 
@@ -31,6 +32,7 @@ from tests.robustness import CACHE
 
 POLICIES = ("isotropic", "adaptive", "refined", "simplified", "marching")
 BINS = (0.0, 0.2, 0.4, 0.6, 0.8, 1.0)
+TENTHS = 10
 SHIFT = 13  # of 20 bodies: another person, in another pose
 
 
@@ -69,7 +71,7 @@ def main() -> None:
     ranges = [f"{low:.1f} to {high:.1f}" for low, high in itertools.pairwise(BINS)]
     for smooth in (False, True):
         matcher = Matcher.load(run, smooth=smooth)
-        print(f"\nsmooth={str(smooth).lower()}\n| | | {' | '.join(ranges)} | all |")
+        print(f"\nsmooth={str(smooth).lower()}\n| | | {' | '.join(ranges)} | all | error |")
         for title, sets in cases.items():
             found = [measure(matcher, shapes, reference) for shapes in sets]
             for kind in found[0]:
@@ -124,7 +126,14 @@ def bin_texts(confidence: np.ndarray, right: np.ndarray) -> list[str]:
         within = (confidence >= low) & ((confidence < high) | (high == BINS[-1]))
         share = f"{100 * right[within].mean():.0f} %" if within.any() else "\u2013"
         texts.append(f"{share} ({100 * within.mean():.0f})")
-    return [*texts, f"{100 * right.mean():.0f} %"]
+    return [*texts, f"{100 * right.mean():.0f} %", f"{expected_error(confidence, right):.3f}"]
+
+
+def expected_error(confidence: np.ndarray, right: np.ndarray) -> float:
+    """The expected calibration error over TENTHS ranges of equal width (Guo et al. 2017)."""
+    place = np.minimum((confidence * TENTHS).astype(int), TENTHS - 1)
+    difference = np.bincount(place, right - confidence.astype(np.float64), minlength=TENTHS)
+    return float(np.abs(difference).sum() / len(confidence))
 
 
 if __name__ == "__main__":

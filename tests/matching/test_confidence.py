@@ -14,6 +14,7 @@ from meshspiral.matching.confidence import (
     map_confidence,
     near_confidence,
     near_vertices,
+    soft_points,
 )
 from tests.meshes import lattice
 
@@ -59,6 +60,23 @@ def test_near_vertices_do_not_cross_a_gap():
     one, above = 0, (rows - 1) * columns
     straight = np.linalg.norm(x[one] - x[above]) / np.sqrt(Mesh(x, sheet.faces).area)
     assert straight < RADIUS and not near[one, above] and near[one, one]
+
+
+def test_a_point_between_vertices_is_their_mean_by_probability():
+    inside, beside, far = SIZE // 2, SIZE // 2 + 1, 0
+    probabilities = 0.5 * one_hot(inside) + 0.3 * one_hot(beside) + 0.2 * one_hot(far)
+    found = distributions(np.concatenate([probabilities, one_hot(far), probabilities]))
+    x = TEMPLATE.vertices
+    points = soft_points(found, np.array([inside, far, -1]), NEAR, x)
+    np.testing.assert_allclose(points[0], (5 * x[inside] + 3 * x[beside]) / 8, rtol=1e-6)
+    np.testing.assert_allclose(points[1], x[far], rtol=1e-6, atol=1e-9)
+    assert np.isnan(points[2]).all()
+
+
+def test_a_label_that_the_network_rules_out_stays_at_its_vertex():
+    found = distributions(one_hot(0))
+    points = soft_points(found, np.array([SIZE // 2]), NEAR, TEMPLATE.vertices)
+    np.testing.assert_array_equal(points, TEMPLATE.vertices[[SIZE // 2]])
 
 
 def test_a_certain_match_has_confidence_1_and_a_contradiction_0():

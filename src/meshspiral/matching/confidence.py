@@ -21,6 +21,7 @@ from meshspiral.geometry.mesh import Mesh
 RADIUS = 0.05  # of sqrt(area), the error up to which a match counts as right
 DETOUR = 1.5  # longest way along edges, in units of RADIUS: leaves out a neighbouring finger
 PAIRS = 512  # pairs of vertices per chunk
+TINY = 1e-20  # probability below which a neighbourhood says nothing
 ROWS = 256  # rows of distances per chunk
 
 
@@ -91,6 +92,33 @@ def near_confidence(found: Distributions, template: np.ndarray, near: csr_array)
         return near[labels].multiply(found.rows(rows)).sum(axis=1)
 
     return _of_pairs(known, pairs, probability)
+
+
+def soft_points(
+    found: Distributions, template: np.ndarray, near: csr_array, vertices: np.ndarray
+) -> np.ndarray:
+    """The mean of the template's vertices near each label, by their predicted probabilities.
+
+    A mesh that is denser than the template thus gets points between the template's vertices.
+
+    Args:
+        found: Of V vertices.
+        template: int [V], their labels; -1 for none.
+        near: From `near_vertices`.
+        vertices: float64 [K, 3], of the template.
+
+    Returns:
+        float64 [V, 3], each as near to its label as those vertices; NaN without a label.
+    """
+    points = np.full((len(template), 3), np.nan)
+    known = np.flatnonzero((template >= 0) & (found.row_of >= 0))
+    for begin in range(0, len(known), PAIRS):
+        chunk = known[begin : begin + PAIRS]
+        weights = near[template[chunk]].multiply(found.rows(found.row_of[chunk])).tocsr()
+        total = weights.sum(axis=1)[:, None]
+        mean = (weights @ vertices) / np.maximum(total, TINY)
+        points[chunk] = np.where(total > TINY, mean, vertices[template[chunk]])
+    return points
 
 
 def map_confidence(

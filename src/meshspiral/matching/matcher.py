@@ -23,7 +23,6 @@ from meshspiral.data.scans import Scan
 from meshspiral.data.tensors import described_tensors, neighbourhood_tensors
 from meshspiral.experiment.run_folder import BEST
 from meshspiral.experiment.schema import TrainConfig
-from meshspiral.geometry.barycentric import interpolate
 from meshspiral.geometry.holes import HOLE, boundary_length
 from meshspiral.geometry.mesh import Mesh
 from meshspiral.geometry.resample import resample, resampled
@@ -33,6 +32,7 @@ from meshspiral.matching.confidence import (
     map_confidence,
     near_confidence,
     near_vertices,
+    soft_points,
 )
 from meshspiral.matching.mean_field import MeanField
 from meshspiral.training.checkpoints import BUNDLED_RUN, config_of, read_checkpoint, template_of
@@ -42,6 +42,7 @@ MESH_STAGES = ("size", "resampling", "descriptors", "neighbourhoods", "network",
 REFINEMENTS = ("zoomout", "crf")
 Report = Callable[[str], None]  # is told each stage when it begins; not every mesh has all
 FACTORS = (1.0, 1.1, 1.2, 1.3, 1.45, 1.6, 1.8, 2.1, 2.5)  # tried for the size of an open surface
+SPREAD = 0.07  # over sqrt(area): how far around a label its point is averaged
 NEAR = 5.0  # mean edges of the template; labels further apart are not interpolated
 
 
@@ -50,8 +51,9 @@ class Labels(NamedTuple):
 
     Attributes:
         template: int32 [V], the corresponding vertex of the template; -1 at a vertex on no face.
-        points: float64 [V, 3], the corresponding point on the template, in the template's unit of
-            length; NaN at a vertex on no face.
+        points: float64 [V, 3], the corresponding point near the template's surface, in the
+            template's unit of length: the mean of the vertices around `template`, weighted by their
+            predicted probabilities. NaN at a vertex on no face.
         confidence: float32 [V], the predicted probability of `template`, in 0..1; 0 at a vertex on
             no face.
         near_confidence: float32 [V], the predicted probability that the true vertex of the template
@@ -176,12 +178,13 @@ class Matcher:
             report("resampling")
             coarse = resample(mesh, self._training_size)
             template, confidence, embedding = self._predict(coarse.mesh, report)
+            points = self._points(template, embedding)
             nearest = coarse.corners[np.arange(len(mesh.vertices)), coarse.weights.argmax(axis=1)]
-            points = self._interpolate(template[coarse.corners], coarse.weights, template[nearest])
+            points = self._interpolate(points[coarse.corners], coarse.weights, points[nearest])
             template, confidence = template[nearest], confidence[nearest]
         else:
             template, confidence, embedding = self._predict(mesh, report)
-            points, nearest = self.template.vertices[template], np.arange(len(template))
+            points, nearest = self._points(template, embedding), np.arange(len(template))
         missing = scan.vertex_of < 0
         template, confidence, points, row_of = (
             values[scan.vertex_of] for values in (template, confidence, points, nearest)
@@ -299,25 +302,33 @@ class Matcher:
         report("network")
         return self._predictor.embed(batch, "evaluation")
 
+    def _points(self, template: np.ndarray, embedding: torch.Tensor) -> np.ndarray:
+        """The points of labels, float64 [W, 3], see `soft_points`."""
+        found = Distributions(embedding, *self._predictor.head, np.arange(len(template)))
+        return soft_points(found, template, self._spread, self.template.vertices)
+
     def _interpolate(
         self, corners: np.ndarray, weights: np.ndarray, nearest: np.ndarray
     ) -> np.ndarray:
-        """Interpolate the labels of the corners of a face.
+        """Interpolate the points of the corners of a face.
 
-        A label further than NEAR mean edges from `nearest` is an error and is left out.
+        A point further than NEAR mean edges from `nearest` is an error and is left out.
 
         Args:
-            corners: int [V, 3], labels of the corners.
+            corners: float [V, 3, 3], points of the corners.
             weights: float64 [V, 3], barycentric coordinates in the face.
-            nearest: int [V], the label of the corner with the largest weight.
+            nearest: float [V, 3], the point of the corner with the largest weight.
 
         Returns:
             float64 [V, 3], points near or on the template.
         """
-        vertices = self.template.vertices
-        distances = np.linalg.norm(vertices[corners] - vertices[nearest][:, None], axis=2)
+        distances = np.linalg.norm(corners - nearest[:, None], axis=2)
         weights = np.where(distances < self._near, weights, 0.0)
-        return interpolate(vertices, corners, weights) / weights.sum(1, keepdims=True)
+        return np.einsum("vc,vcx->vx", weights, corners) / weights.sum(1, keepdims=True)
+
+    @cached_property
+    def _spread(self) -> csr_array:
+        return near_vertices(self.template, SPREAD)
 
     @cached_property
     def _mean_field(self) -> MeanField:

@@ -100,8 +100,8 @@ def view_html(match: FileMatch, template: Mesh, up: str, carried: np.ndarray | N
     """
     other, source = sides_of(match, template, carried)
     links = [_counterparts(*pair, template.size) for pair in ((other, source), (source, other))]
-    if match.map is not None:
-        links[1] = _mapped(source, other, match.map, template.size)
+    found = match.source.labels.template if match.map is None else match.map
+    links[1] = _mapped(source, other, found, template.size)
     sides = [side.packed(up, *link) for side, link in zip((other, source), links, strict=True)]
     names = {"correspondence": "correspondence", "confidence": "confidence"}
     names |= {"carried": "carried from the target"} if "carried" in source.colors else {}
