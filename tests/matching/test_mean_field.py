@@ -6,10 +6,17 @@ import numpy as np
 import pytest
 import torch
 
-from meshspiral import Matcher, scan
+from meshspiral import Matcher, Mesh, scan
 from meshspiral.data.datasets.bodies import Bodies
 from meshspiral.matching import mean_field
-from meshspiral.matching.mean_field import REACH, STRENGTH, WIDTH, MeanField, neighbour_mean
+from meshspiral.matching.mean_field import (
+    REACH,
+    STRENGTH,
+    WIDTH,
+    MeanField,
+    likeliest_near,
+    neighbour_mean,
+)
 from tests.meshes import bumpy_sphere, punctured
 
 SPHERE = bumpy_sphere(subdivisions=3)
@@ -60,13 +67,30 @@ def test_scattered_errors_take_the_labels_of_their_neighbours(mesh):
     assert (found[right] == right).mean() > 0.99
 
 
+def test_the_likeliest_label_near_another():
+    """On a line, with a sure label far away, a likely one near, and nothing else."""
+    far, near, at = 0, 41, 40
+    vertices = np.array([[k, 0, 0] for k in range(60)], dtype=float)
+    vertices[-1, 1] = 1.0  # or the faces had no area
+    faces = np.stack([np.arange(58), np.arange(1, 59), np.full(58, 59)], axis=1)
+    template = Mesh(vertices, faces)
+    scores = np.full((1, 60), -20.0, dtype=np.float32)
+    scores[0, [far, near]] = 0.0, -3.0
+    squares = (np.array([near, far]) - at) ** 2 / template.area / (2 * mean_field.NEAR**2)
+    expected = near if -3.0 - squares[0] > -squares[1] else far
+    assert expected == near
+    assert likeliest_near(scores, np.array([at]), template).tolist() == [near]
+    scores[0, near] = -20.0
+    assert likeliest_near(scores, np.array([far]), template).tolist() == [far]
+
+
 def test_the_bundled_network_errs_less_with_it():
     bodies = Bodies(1500)
     mesh = bodies.load("s9_squat").mesh
     place = bodies.template.vertices
     errors = []
-    for refine in (None, "crf"):
+    for refine in (None, "crf", "zoomout"):
         labels = Matcher.load(refine=refine).label(scan(mesh.vertices, mesh.faces, "a"))
         errors.append(np.linalg.norm(place[labels.template] - place, axis=1).mean())
         assert labels.confidence.min() >= 0 and labels.confidence.max() <= 1
-    assert errors[1] < errors[0]
+    assert errors[2] < errors[1] < errors[0]

@@ -34,7 +34,7 @@ from meshspiral.matching.confidence import (
     near_vertices,
     soft_points,
 )
-from meshspiral.matching.mean_field import MeanField
+from meshspiral.matching.mean_field import MeanField, likeliest_near
 from meshspiral.training.checkpoints import BUNDLED_RUN, config_of, read_checkpoint, template_of
 from meshspiral.training.predictor import Predictor
 
@@ -97,9 +97,10 @@ class Matcher:
             the labels. False: never. None: only a mesh with so many more or fewer vertices that it
             is outside the `density_range` of the network's neighbourhood.
         smooth: The same as refine="zoomout".
-        refine: How to refine the labels of every mesh, one of REFINEMENTS: "zoomout" for complete
-            surfaces (Melzi et al. 2019), or "crf", which surfaces with holes can have too, see
-            `meshspiral.matching.mean_field`. None: not.
+        refine: How to refine the labels of every mesh, one of REFINEMENTS: "crf" by the labels of
+            neighbours, see `meshspiral.matching.mean_field`; or "zoomout" for complete surfaces,
+            which then refines these by ZoomOut (Melzi et al. 2019), and finally takes for each
+            vertex the label near its own that the network finds likeliest. None: not.
         scale: Length of one unit of the meshes in the template's unit; the bundled template is in
             metres. Radii are then those of a body of the template's size. None: they follow from
             the surface area; if a mesh has large holes, the size is sought, see `surest_size`.
@@ -280,14 +281,20 @@ class Matcher:
         template, confidence = prediction.classes.cpu().numpy(), prediction.probability
         if self._refine is not None:
             report("refinement")
-            if self._refine == "zoomout":
-                template = zoomout(*eigenfunctions(mesh, TO), self._eigenfunctions, template)
-            else:
-                weight, bias = self._predictor.head
-                scores = torch.addmm(bias, embedding.to(weight.dtype), weight.T)
-                template = self._mean_field(torch.log_softmax(scores, 1).cpu().numpy(), mesh)
+            template = self._refined(mesh, embedding)
             confidence = self._predictor.predict(embedding, torch.from_numpy(template)).of_label
         return template, confidence.float().cpu().numpy(), embedding
+
+    def _refined(self, mesh: Mesh, embedding: torch.Tensor) -> np.ndarray:
+        """Refined labels, int64 [W], by what `refine` of the class says."""
+        weight, bias = self._predictor.head
+        scores = torch.addmm(bias, embedding.to(weight.dtype), weight.T)
+        log_probability = torch.log_softmax(scores, 1).cpu().numpy()
+        template = self._mean_field(log_probability, mesh)
+        if self._refine == "zoomout":
+            template = zoomout(*eigenfunctions(mesh, TO), self._eigenfunctions, template)
+            template = likeliest_near(log_probability, template, self.template)
+        return template
 
     def _embed(self, mesh: Mesh, report: Report) -> torch.Tensor:
         """The input of the network's last layer, [W, C], for each vertex of a mesh."""

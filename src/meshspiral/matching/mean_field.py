@@ -22,6 +22,8 @@ REACH = 2.5  # widths, beyond which the potential is 0
 STRENGTH = 8.0  # weight of the neighbours
 STEPS = 5
 MOST_HOPS = 8
+NEAR = 0.05  # over sqrt(area), see `likeliest_near`
+ROWS = 256  # vertices at a time
 
 
 class MeanField:
@@ -57,6 +59,27 @@ class MeanField:
             message = (self._kernel @ np.ascontiguousarray(field.T)).T
             field = softmax(log_probability + STRENGTH * message)
         return field.argmax(axis=1)
+
+
+def likeliest_near(log_probability: np.ndarray, labels: np.ndarray, template: Mesh) -> np.ndarray:
+    """The likeliest label of each vertex if its place is known up to a normal distribution.
+
+    Args:
+        log_probability: float32 [W, K], of the network.
+        labels: int64 [W], the template vertices at the means of the distributions, whose standard
+            deviation is NEAR sqrt(area).
+        template: The mesh with K vertices.
+
+    Returns:
+        int64 [W].
+    """
+    found = np.empty_like(labels)
+    places = template.vertices / template.size
+    for begin in range(0, len(labels), ROWS):
+        rows = slice(begin, begin + ROWS)
+        squares = ((places[labels[rows], None] - places) ** 2).sum(axis=2)
+        found[rows] = (log_probability[rows] - squares / (2 * NEAR**2)).argmax(axis=1)
+    return found
 
 
 def neighbour_mean(mesh: Mesh) -> csr_array:
