@@ -143,11 +143,11 @@ def test_an_init_that_is_no_run_is_a_one_line_error(cli, toy_overrides, tmp_path
 
 
 def test_bundled_is_the_network_of_the_matcher(toy_overrides, template):
-    size = ["model.channels=[32,64,128]", "data.shot.bins=16"]
-    config = composed([*toy_overrides, "model=gcnn3", "init=bundled", *size])
+    size = ["model.channels=[100,150,200]", "data.shot.bins=16"]
+    config = composed([*toy_overrides, *size, "variant=matcher", "init=bundled"])
     module = Correspondence(config.model_dump(), 544, 162)
     [first, *_] = InitialWeights(config, 544).load_into(module, template)
-    assert "weights of gcnn3 trained on bodies" in first
+    assert "weights of fcs trained on anny" in first
     theirs = Matcher.load()._predictor.module.net
     for ours, there in zip(module.net.layers.parameters(), theirs.layers.parameters(), strict=True):
         assert torch.equal(ours, there)

@@ -182,7 +182,7 @@ class Matcher:
             points = self._points(template, embedding)
             nearest = coarse.corners[np.arange(len(mesh.vertices)), coarse.weights.argmax(axis=1)]
             points = self._interpolate(points[coarse.corners], coarse.weights, points[nearest])
-            template, confidence = template[nearest], confidence[nearest]
+            template, confidence = self._nearest_vertices(points), confidence[nearest]
         else:
             template, confidence, embedding = self._predict(mesh, report)
             points, nearest = self._points(template, embedding), np.arange(len(template))
@@ -332,6 +332,10 @@ class Matcher:
         distances = np.linalg.norm(corners - nearest[:, None], axis=2)
         weights = np.where(distances < self._near, weights, 0.0)
         return np.einsum("vc,vcx->vx", weights, corners) / weights.sum(1, keepdims=True)
+
+    def _nearest_vertices(self, points: np.ndarray) -> np.ndarray:
+        """The template vertex nearest to each point, int64 [V]."""
+        return cKDTree(self.template.vertices).query(points)[1]
 
     @cached_property
     def _spread(self) -> csr_array:
