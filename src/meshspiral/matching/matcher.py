@@ -138,7 +138,7 @@ class Matcher:
 
         Args:
             run: The run folder; only checkpoints/best.ckpt is read. None: the bundled network,
-                trained on complete human bodies.
+                trained on human bodies.
             **options: `accelerator`, `resampled`, `smooth`, `refine` and `scale` of the class.
 
         Raises:
