@@ -38,7 +38,7 @@ SWEEP = {
 }
 
 
-REMESH = ["data.remesh={policy: mixed, vertices: 120, copies: 1}"]
+REMESH = ["data.remesh={policy: mixed, vertices: 120, copies: 1, shared: null}"]
 
 
 @pytest.fixture(scope="module")
