@@ -80,7 +80,7 @@ def cut_at_the_waist(body: Shape, rng: np.random.Generator) -> Shape:
     return with_mesh(body, vertices, faces[keep[faces].all(axis=1)])
 
 
-def one_arm_and_the_head(body: Shape, rng: np.random.Generator) -> Shape:
+def three_parts(body: Shape, rng: np.random.Generator) -> Shape:
     """By the template's rest pose, in which the arms point sideways."""
     vertices = Bodies(len(body.labels)).template.vertices
     neck = np.quantile(vertices[:, 2], 0.9)
@@ -97,7 +97,7 @@ CHANGES: dict[str, Callable[[Shape, np.random.Generator], Shape]] = {
     "noise of 2 mm": add_noise,
     "a tenth of the faces removed": remove_faces,
     "cut off at the waist": cut_at_the_waist,
-    "one arm and the head": one_arm_and_the_head,
+    "an arm, the head, part of a leg": three_parts,
 }
 
 

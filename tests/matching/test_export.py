@@ -18,6 +18,7 @@ from meshspiral.matching.export import dense_map
 from meshspiral.matching.job import LabelledScan
 from meshspiral.matching.matcher import Labels
 from meshspiral.matching.morph import morph_glb
+from meshspiral.matching.pictures import align_to_template
 from meshspiral.matching.registration import registered, spanning_faces
 
 BODIES = Bodies(1500)
@@ -50,6 +51,20 @@ def test_a_missing_part_is_bridged_with_confidence_zero():
     assert np.isfinite(positions).all()
     assert (confidence[height < np.quantile(height, 0.1)] == 0).mean() > 0.9
     assert (confidence[keep] > 0.9).mean() > 0.98
+
+
+def test_a_part_is_shown_in_the_size_that_it_has_in_the_whole():
+    sizes = []
+    for keep in (None, SQUAT.vertices[:, 2] > np.median(SQUAT.vertices[:, 2])):
+        labelled = perfect(SQUAT, keep)
+        shown = align_to_template(labelled.scan, labelled.labels, TEMPLATE)
+        a, b, _ = shown.vertices[shown.faces].transpose(1, 0, 2)
+        sizes.append(np.median(np.linalg.norm(a - b, axis=1)))
+    own = SQUAT.vertices[labelled.scan.faces]
+    upper = np.median(np.linalg.norm(own[:, 0] - own[:, 1], axis=1))
+    a, b, _ = SQUAT.vertices[SQUAT.faces].transpose(1, 0, 2)
+    whole = np.median(np.linalg.norm(a - b, axis=1))
+    assert sizes[1] / upper == pytest.approx(sizes[0] / whole, rel=0.15)
 
 
 def test_one_wrong_label_does_not_move_the_surface():

@@ -10,6 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from meshspiral.data.files import write_file
 from meshspiral.data.scans import Scan
+from meshspiral.geometry.holes import HOLE, boundary_length
 from meshspiral.geometry.mesh import Mesh
 from meshspiral.matching.job import FileMatch
 from meshspiral.matching.matcher import Labels
@@ -78,13 +79,17 @@ def own_colors(scan: Scan) -> np.ndarray:
 def align_to_template(scan: Scan, labels: Labels, template: Mesh) -> Mesh:
     """The mesh of a scan, scaled, translated and rotated to fit its labels on the template.
 
-    The mesh gets the template's area; the rotation is the best in the sense of least squares,
-    weighted by confidence (Kabsch 1976).
+    The mesh gets the template's area, or if it has large holes, the extent of its labels. The
+    rotation is the best in the sense of least squares, weighted by confidence (Kabsch 1976).
     """
     mesh, points = scan.mesh, labels.points[scan.origin]
     weights = labels.confidence[scan.origin] + 1e-6  # never all zero
-    vertices = mesh.vertices * np.sqrt(template.area / mesh.area)
-    vertices -= np.average(vertices, axis=0, weights=weights)
+    vertices = mesh.vertices - np.average(mesh.vertices, axis=0, weights=weights)
     centred_points = points - np.average(points, axis=0, weights=weights)
+    if boundary_length(mesh) > 2 * np.pi * HOLE * mesh.size:
+        extents = [np.average((x**2).sum(1), weights=weights) for x in (centred_points, vertices)]
+        vertices *= np.sqrt(extents[0] / extents[1])
+    else:
+        vertices *= template.size / mesh.size
     rotation, _ = Rotation.align_vectors(centred_points, vertices, weights)
     return Mesh(rotation.apply(vertices), mesh.faces, mesh.name)
