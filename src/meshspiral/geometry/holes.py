@@ -59,6 +59,11 @@ def close_holes(mesh: Mesh, radius: float = HOLE) -> Mesh:
     return mesh.with_faces(np.concatenate([mesh.faces, *added])) if added else mesh
 
 
+def has_large_holes(mesh: Mesh) -> bool:
+    """Whether all boundaries together are longer than the largest hole that is closed."""
+    return boundary_length(mesh) > 2 * np.pi * HOLE * mesh.size
+
+
 def boundary_length(mesh: Mesh) -> float:
     """The length of all boundaries, in the mesh's unit."""
     edges = directed_edges(mesh.faces).astype(np.int64)

@@ -23,7 +23,7 @@ from meshspiral.data.scans import Scan
 from meshspiral.data.tensors import described_tensors, neighbourhood_tensors
 from meshspiral.experiment.run_folder import BEST
 from meshspiral.experiment.schema import TrainConfig
-from meshspiral.geometry.holes import HOLE, boundary_length
+from meshspiral.geometry.holes import has_large_holes
 from meshspiral.geometry.mesh import Mesh
 from meshspiral.geometry.resample import resample, resampled
 from meshspiral.geometry.zoomout import TO, eigenfunctions, zoomout
@@ -224,7 +224,7 @@ class Matcher:
         if self._scale is not None:
             whole = (self.template.size / self._scale) ** 2
             return Mesh(mesh.vertices, mesh.faces, mesh.name, whole)
-        if boundary_length(mesh) <= 2 * np.pi * HOLE * mesh.size:
+        if not has_large_holes(mesh):
             return mesh
         report("size")
         whole = (self.surest_size(mesh) * mesh.size) ** 2

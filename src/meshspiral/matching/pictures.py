@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from meshspiral.data.files import write_file
 from meshspiral.data.scans import Scan
-from meshspiral.geometry.holes import HOLE, boundary_length
+from meshspiral.geometry.holes import has_large_holes
 from meshspiral.geometry.mesh import Mesh
 from meshspiral.matching.job import FileMatch
 from meshspiral.matching.matcher import Labels
@@ -86,7 +86,7 @@ def align_to_template(scan: Scan, labels: Labels, template: Mesh) -> Mesh:
     weights = labels.confidence[scan.origin] + 1e-6  # never all zero
     vertices = mesh.vertices - np.average(mesh.vertices, axis=0, weights=weights)
     centred_points = points - np.average(points, axis=0, weights=weights)
-    if boundary_length(mesh) > 2 * np.pi * HOLE * mesh.size:
+    if has_large_holes(mesh):
         extents = [np.average((x**2).sum(1), weights=weights) for x in (centred_points, vertices)]
         vertices *= np.sqrt(extents[0] / extents[1])
     else:
