@@ -73,6 +73,25 @@ def test_training_shapes_may_share_tessellations(tmp_path):
         Remeshed(Toys(), Cache(tmp_path), 1, "isotropic", 120, shared=3)
 
 
+def test_a_shape_is_prepared_anew_once_the_one_it_is_remeshed_as_has_changed(tmp_path):
+    class Stamped(Toys):
+        changed = ""
+
+        def stamp(self, name):
+            return f"{name} {'new' if name == self.changed else 'old'}"
+
+    toys = Stamped()
+    shapes = Remeshed(toys, Cache(tmp_path), 1, "isotropic", 120, copies=4, shared=2)
+    names = shapes.names["train"]
+    before = {name: shapes.stamp(name) for name in names}
+    for toys.changed in ("train/0.ply", "train/1.ply"):
+        for name in names:
+            drawn = shapes._pattern(name) == toys.changed
+            itself = name.partition("~")[0] == toys.changed
+            assert (shapes.stamp(name) != before[name]) == (drawn or itself)
+    assert {shapes._pattern(name) for name in names} == {"train/0.ply", "train/1.ply"}
+
+
 def test_each_shape_draws_its_size_from_a_range(tmp_path):
     shapes = Remeshed(Toys(), Cache(tmp_path), 1, "isotropic", [80, 160], copies=3)
     sizes = {len(shapes.load(name).mesh.vertices) for name in shapes.names["train"]}

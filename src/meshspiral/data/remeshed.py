@@ -112,8 +112,8 @@ class Remeshed(ShapeSet):
             return None
         code = code_version(remesh, meshes, sys.modules[__name__])
         settings = f"{self._policy}|{self._vertices}|{copy}|{len(self._shared)}"
-        if name in self._train:
-            settings += "".join(str(self._base.stamp(each)) for each in self._shared[:1])
+        if pattern := self._pattern(name):
+            settings += f"|{self._base.stamp(pattern)}"
         return f"{stamp}|{settings}|{code}|{self._version}"
 
     def source(self, name: str) -> Shape:
@@ -132,11 +132,16 @@ class Remeshed(ShapeSet):
         """Name of the shape in the other data set, and the number of this copy, counted from 1."""
         return self._copies.get(name, (name, 1))
 
+    def _pattern(self, name: str) -> str | None:
+        """The name of the shape whose tessellation a shape shares; None if it has its own."""
+        if not (self._shared and name in self._train):
+            return None
+        return self._shared[derived_seed("tessellation", name) % len(self._shared)]
+
     def _tessellation(self, name: str) -> tuple[Shape | None, Task]:
         """The shape whose tessellation a shape shares, None if it has its own; and its task."""
-        if name in self._train and self._shared:
-            drawn = derived_seed("tessellation", name) % len(self._shared)
-            pattern = self._base.load(self._shared[drawn])
+        if shared := self._pattern(name):
+            pattern = self._base.load(shared)
             return pattern, self._task(pattern.mesh, 1)
         return None, self._task(self.source(name).mesh, self._original(name)[1])
 

@@ -113,6 +113,12 @@ class Mesh:
         return float(np.linalg.norm(self.face_normals, axis=1).sum() / 2)
 
     @cached_property
+    def mean_edge(self) -> float:
+        """The mean length of the faces' edges, an edge of two faces counted twice."""
+        corners = self.vertices[self.faces]
+        return float(np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).mean())
+
+    @cached_property
     def size(self) -> float:
         """The length to which radii relate: the square root of the complete surface's area."""
         return float(np.sqrt(self.area if self.whole is None else self.whole))

@@ -8,10 +8,10 @@ from typing import NamedTuple
 from urllib.parse import quote
 
 import numpy as np
-from jinja2 import Environment, FileSystemLoader
 
 from meshspiral.data.files import write_file
 from meshspiral.matching.writing import RESULT
+from meshspiral.viz.pages import fill_page
 
 INDEX = "index.html"
 UNSURE = 0.5  # a vertex with less confidence counts as unsure
@@ -45,10 +45,8 @@ def write_index(folder: Path, names: Iterable[str], refused: Iterable[str]) -> N
     """
     found = filter(None, (read_entry(folder, name) for name in names))
     entries = sorted(found, key=lambda entry: (-entry.unsure, entry.median, entry.name))
-    environment = Environment(
-        loader=FileSystemLoader(Path(__file__).parent), autoescape=True, trim_blocks=True
-    )
-    html = environment.get_template(INDEX).render(
+    html = fill_page(
+        Path(__file__).with_name(INDEX),
         title=f"{len(entries)} {'match' if len(entries) == 1 else 'matches'} in {folder.name}",
         entries=entries,
         refused=sorted(refused),

@@ -8,6 +8,7 @@ match.target[v]  # the vertex of b that corresponds to vertex v of a
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -39,7 +40,6 @@ from meshspiral.training.checkpoints import BUNDLED_RUN, config_of, read_checkpo
 from meshspiral.training.predictor import Predictor
 
 MESH_STAGES = ("size", "resampling", "descriptors", "neighbourhoods", "network", "refinement")
-REFINEMENTS = ("zoomout", "crf")
 Report = Callable[[str], None]  # is told each stage when it begins; not every mesh has all
 FACTORS = (1.0, 1.1, 1.2, 1.3, 1.45, 1.6, 1.8, 2.1, 2.5)  # tried for the size of an open surface
 SPREAD = 0.07  # over sqrt(area): how far around a label its point is averaged
@@ -97,10 +97,10 @@ class Matcher:
             the labels. False: never. None: only a mesh with so many more or fewer vertices that it
             is outside the `density_range` of the network's neighbourhood.
         smooth: The same as refine="zoomout".
-        refine: How to refine the labels of every mesh, one of REFINEMENTS: "crf" by the labels of
-            neighbours, see `meshspiral.matching.mean_field`; or "zoomout" for complete surfaces,
-            which then refines these by ZoomOut (Melzi et al. 2019), and finally takes for each
-            vertex the label near its own that the network finds likeliest. None: not.
+        refine: "crf": refine the labels of every mesh by those of neighbours, see
+            `meshspiral.matching.mean_field`. "zoomout", for complete surfaces: refine them further
+            by ZoomOut (Melzi et al. 2019), then take for each vertex the nearby label that the
+            network finds likeliest. None: do not refine.
         scale: Length of one unit of the meshes in the template's unit; the bundled template is in
             metres. Radii are then those of a body of the template's size. None: they follow from
             the surface area; if a mesh has large holes, the size is sought, see `surest_size`.
@@ -223,12 +223,12 @@ class Matcher:
         """The mesh with the area of the complete surface, if it is known or can be found."""
         if self._scale is not None:
             whole = (self.template.size / self._scale) ** 2
-            return Mesh(mesh.vertices, mesh.faces, mesh.name, whole)
+            return replace(mesh, whole=whole)
         if not has_large_holes(mesh):
             return mesh
         report("size")
         whole = (self.surest_size(mesh) * mesh.size) ** 2
-        return Mesh(mesh.vertices, mesh.faces, mesh.name, whole)
+        return replace(mesh, whole=whole)
 
     def surest_size(self, mesh: Mesh) -> float:
         """The size of the complete surface at which the network is surest of its labels.
@@ -249,8 +249,7 @@ class Matcher:
             mesh = resampled(mesh, self._training_size)
         area, sure = mesh.area, []
         for factor in FACTORS:
-            sized = Mesh(mesh.vertices, mesh.faces, mesh.name, factor**2 * area)
-            probability = self._probability(normalize(sized))
+            probability = self._probability(normalize(replace(mesh, whole=factor**2 * area)))
             sure.append(np.average(probability, weights=mesh.vertex_areas))
         return FACTORS[int(np.argmax(sure))]
 
@@ -347,9 +346,7 @@ class Matcher:
 
     @cached_property
     def _near(self) -> float:
-        a, b, c = (self.template.vertices[self.template.faces[:, i]] for i in range(3))
-        edges = np.concatenate([b - a, c - b, a - c])
-        return NEAR * float(np.linalg.norm(edges, axis=1).mean())
+        return NEAR * self.template.mean_edge
 
     @cached_property
     def _near_vertices(self) -> csr_array:

@@ -37,7 +37,7 @@ def registered(labelled: LabelledScan, template: Mesh) -> tuple[np.ndarray, np.n
     """
     mesh, labels = labelled.scan.mesh, labelled.labels
     points, confidence = labelled.on_mesh(labels.points), labelled.on_mesh(labels.confidence)
-    edge = mean_edge_of(template)
+    edge = template.mean_edge
     sound = spanning_faces(points, mesh.faces, template)
     found = np.zeros((len(template.vertices), 3))
     weights = np.zeros(len(template.vertices))
@@ -71,12 +71,6 @@ def spanning_faces(points: np.ndarray, faces: np.ndarray, template: Mesh) -> np.
     corners = points[faces]
     sides = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2)
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    edge = mean_edge_of(template)
+    edge = template.mean_edge
     wide = np.linalg.norm(normals, axis=1) > FLAT * edge**2
     return wide & (sides.max(axis=1) < STRETCH * edge)
-
-
-def mean_edge_of(mesh: Mesh) -> float:
-    """The mean length of the edges of the faces."""
-    corners = mesh.vertices[mesh.faces]
-    return float(np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).mean())

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jinja2 import Environment, FileSystemLoader
 from plotly.offline import get_plotlyjs
 from scipy.spatial import cKDTree
 
@@ -17,7 +15,7 @@ from meshspiral.matching.job import FileMatch, LabelledScan
 from meshspiral.matching.pictures import align_to_template, own_colors
 from meshspiral.matching.transfer import transfer
 from meshspiral.viz.colors import GREY, confidence_colors, point_colors, template_colors
-from meshspiral.viz.packing import pack_array
+from meshspiral.viz.pages import fill_page, pack_array, script_json
 from meshspiral.viz.render import upright
 
 MOST_VERTICES = 20_000  # shown of a mesh; a larger one is thinned
@@ -105,15 +103,13 @@ def view_html(match: FileMatch, template: Mesh, up: str, carried: np.ndarray | N
     sides = [side.packed(up, *link) for side, link in zip((other, source), links, strict=True)]
     names = {"correspondence": "correspondence", "confidence": "confidence"}
     names |= {"carried": "carried from the target"} if "carried" in source.colors else {}
-    environment = Environment(
-        loader=FileSystemLoader(Path(__file__).parent), autoescape=True, trim_blocks=True
-    )
-    return environment.get_template("view.html").render(
+    return fill_page(
+        Path(__file__).with_name("view.html"),
         title=f"{source.name} and {other.name}",
         names=[f"{side.noun}: {side.name}" for side in (other, source)],
         colorings=list(names.items()),
         notes=[side.note for side in (other, source) if side.note],
-        data=json.dumps({"sides": sides}).replace("<", "\\u003c"),
+        data=script_json({"sides": sides}),
         plotly=get_plotlyjs(),
     )
 

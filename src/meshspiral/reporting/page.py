@@ -2,19 +2,18 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jinja2 import Environment, FileSystemLoader
 from plotly.offline import get_plotlyjs
 
 from meshspiral.reporting.groups import Group, format_value, other_keys
 from meshspiral.reporting.scenes import Scenes
 from meshspiral.reporting.tables import METRIC_COLUMNS, format_metric, group_table, run_table
 from meshspiral.viz.colors import ERROR_COLORS, MOST_ERROR
+from meshspiral.viz.pages import fill_page, script_json
 
 # columns that few readers need; a checkbox shows them, or the table would not fit a laptop's screen
 RARE = {METRIC_COLUMNS[key] for key in ("val/exact_match", "parameters", "seconds/train")}
@@ -38,18 +37,13 @@ def page_html(
         scenes: Test shapes to show in 3D.
         notes: Warnings, one line each.
     """
-    environment = Environment(
-        loader=FileSystemLoader(Path(__file__).parent),
-        autoescape=True,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
     columns, rows = run_table(groups)
     seed_columns, group_rows = group_table(groups)
     rare = RARE | set(other_keys(groups)[MOST_SETTINGS:])
     scale = (255 * ERROR_COLORS(np.linspace(0, 1, 256))[:, :3]).round().astype(int).tolist()
-    data = json.dumps({"scenes": scenes.scenes, "surfaces": scenes.surfaces, "scale": scale})
-    return environment.get_template("page.html").render(
+    data = {"scenes": scenes.scenes, "surfaces": scenes.surfaces, "scale": scale}
+    return fill_page(
+        Path(__file__).with_name("page.html"),
         columns=columns,
         rare=rare,
         texts=["data", *other_keys(groups)],
@@ -64,7 +58,7 @@ def page_html(
         runs=len(rows),
         scenes=len(scenes.scenes),
         max_error=MOST_ERROR,
-        data=data.replace("<", "\\u003c"),  # or a name could end the script element
+        data=script_json(data),
         plotly=get_plotlyjs() if scenes.scenes else "",
     )
 

@@ -17,7 +17,7 @@ from meshspiral.geometry.digest import digest
 from meshspiral.geometry.mesh import Mesh, MeshError
 from meshspiral.reporting.runs import Run
 from meshspiral.viz.colors import MOST_ERROR, template_colors
-from meshspiral.viz.packing import pack_array
+from meshspiral.viz.pages import pack_array
 from meshspiral.viz.render import upright
 
 
