@@ -5,14 +5,22 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from meshspiral.data.damaged import Damaged, damaged
+from meshspiral.data.damaged import Damaged, damaged, warped
 from meshspiral.data.datasets.bodies import Bodies
 from meshspiral.data.settings import DamageSettings
 from meshspiral.data.shapes import Shape, SurfacePoints
 from meshspiral.experiment.compose import compose_train
 from meshspiral.experiment.schema import ConfigError
 
-NONE = {"noise": 0.0, "share": 1.0, "cut": 0.0, "holes": 0, "hole_radius": 0.1, "missing": 0.0}
+NONE = {
+    "noise": 0.0,
+    "warp": 0.0,
+    "share": 1.0,
+    "cut": 0.0,
+    "holes": 0,
+    "hole_radius": 0.1,
+    "missing": 0.0,
+}
 BODIES = Bodies(1500)
 BODY = BODIES.load("s0_a_pose")
 
@@ -69,6 +77,29 @@ def test_noise_moves_vertices_by_its_deviation():
         for seed in range(20)
     ]
     assert max(moved) <= 0.0101 and np.mean(moved) == pytest.approx(0.005, rel=0.4)
+
+
+def test_a_warp_is_smooth_and_as_strong_as_its_amplitude():
+    grid = np.random.default_rng(1).uniform(size=(2000, 3))
+    step = 1e-4
+    strains = []
+    for seed in range(20):
+        one, other = (
+            warped(grid + shift, 0.02, 1.0, np.random.default_rng(seed))
+            for shift in (0.0, np.array([step, 0, 0]))
+        )
+        lengths = np.linalg.norm(other - one, axis=1) / step
+        assert lengths.min() > 0.3 and lengths.max() < 1.7  # nothing folds
+        strains.append(np.std(lengths))
+    assert 0.03 < np.mean(strains) < 0.15
+
+
+def test_a_warped_shape_keeps_its_faces_and_labels():
+    shape = apply(1, warp=0.02)
+    np.testing.assert_array_equal(shape.labels, BODY.labels)
+    moved = np.linalg.norm(shape.mesh.vertices - BODY.mesh.vertices, axis=1) / BODY.mesh.size
+    assert moved.mean() > 1e-4 and moved.max() < 4 * 0.02 * 0.8
+    assert len(shape.mesh.faces) == len(BODY.mesh.faces)
 
 
 def test_the_size_errs_by_at_most_its_share():

@@ -1,4 +1,4 @@
-"""Training shapes damaged as scans are: noise, holes, missing faces and missing parts."""
+"""Training shapes damaged as scans are: noise, warps, holes, missing faces and parts."""
 
 from __future__ import annotations
 
@@ -14,6 +14,8 @@ from meshspiral.geometry.digest import derived_seed
 from meshspiral.geometry.mesh import Mesh, in_use
 
 SMALLEST_HOLE = 0.02  # radius over the size of the shape
+WAVES = 4  # of a warp
+WAVELENGTHS = (0.1, 0.8)  # over the size of the shape
 KEPT = (0.35, 0.9)  # share of the vertices on the kept side of a cut
 LEAST = 0.25  # share of the vertices that must be left
 
@@ -55,8 +57,11 @@ class Damaged(ShapeSet):
 def damaged(shape: Shape, settings: DamageSettings, rng: np.random.Generator) -> Shape:
     """A damaged copy of a shape, without the vertices that lose their faces."""
     mesh = shape.mesh
+    vertices = mesh.vertices
+    if settings.warp:
+        vertices = warped(vertices, rng.uniform(0, settings.warp), mesh.size, rng)
     noise = rng.uniform(0, settings.noise) * mesh.size
-    vertices = mesh.vertices + rng.normal(scale=noise, size=mesh.vertices.shape)
+    vertices = vertices + rng.normal(scale=noise, size=vertices.shape)
     whole = (mesh.size * np.exp(rng.uniform(-settings.size, settings.size))) ** 2
     faces = mesh.faces
     if rng.random() < settings.share:
@@ -74,6 +79,36 @@ def damaged(shape: Shape, settings: DamageSettings, rng: np.random.Generator) ->
     points = shape.points and SurfacePoints(*(array[used] for array in shape.points))
     left = holes.close_holes(Mesh(vertices[used], faces, mesh.name, float(whole)))
     return Shape(left, shape.labels[used], shape.template_size, points)
+
+
+def warped(
+    points: np.ndarray, amplitude: float, size: float, rng: np.random.Generator
+) -> np.ndarray:
+    """Points in a smoothly warped space, as the proportions and clothes of people differ.
+
+    The displacement is a sum of plane waves. Its derivative has a standard deviation of about
+    9 times the amplitude, so a length changes by up to a fifth or so at an amplitude of 0.02.
+
+    Args:
+        points: Points, float [P, 3].
+        amplitude: Length of each wave's displacement, over its wavelength.
+        size: The unit of WAVELENGTHS, in the unit of the points.
+        rng: Draws the waves.
+
+    Returns:
+        The moved points, float [P, 3].
+    """
+    lengths = size * np.exp(rng.uniform(*np.log(WAVELENGTHS), size=WAVES))
+    towards, along = (unit_vectors(WAVES, rng) for _ in range(2))
+    phases = rng.uniform(0, 2 * np.pi, size=WAVES)
+    waves = np.sin(2 * np.pi * points @ (towards / lengths[:, None]).T + phases)
+    return points + waves @ (amplitude * lengths[:, None] * along)
+
+
+def unit_vectors(count: int, rng: np.random.Generator) -> np.ndarray:
+    """Random directions, float [count, 3]."""
+    vectors = rng.normal(size=(count, 3))
+    return vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
 
 
 def beyond_plane(vertices: np.ndarray, rng: np.random.Generator) -> np.ndarray:

@@ -69,6 +69,9 @@ class DamageSettings(Strict):
     """Damage of the training shapes, drawn for each. Lengths are over sqrt(area)."""
 
     noise: float = Field(ge=0, description="largest standard deviation of the vertices' noise")
+    warp: float = Field(
+        ge=0, le=0.05, description="largest amplitude of a smooth warp, over its wavelength"
+    )
     share: float = Field(ge=0, le=1, description="share of the shapes that lose parts")
     cut: float = Field(ge=0, le=1, description="share of these that are cut by a plane")
     holes: int = Field(ge=0, description="most holes in these")

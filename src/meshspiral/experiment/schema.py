@@ -393,6 +393,8 @@ def upgraded(values: dict[str, Any]) -> dict[str, Any]:
         data["remesh"].setdefault("shared", None)
     data.setdefault("remesh", None)
     data.setdefault("damage", None)
+    if isinstance(data["damage"], dict):
+        data["damage"].setdefault("warp", 0.0)
     if data.get("name") == "anny":
         data.setdefault("surface", None)
     data.setdefault("features", ["shot"])
