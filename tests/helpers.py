@@ -17,9 +17,17 @@ from meshspiral.experiment.run_folder import CONFIG, LAST
 from meshspiral.experiment.runs import claim
 from meshspiral.training.run import train
 
-__all__ = ["METRICS", "QUICK", "ROOT", "STARTED", "composed"]
+__all__ = ["METRICS", "QUICK", "ROOT", "SMALL", "STARTED", "composed"]
 
 ROOT = Path(CONF).parent
+SMALL = {  # overrides that make each network small
+    "fcs": ["model.channels=[5,6,7]"],
+    "lstm": ["model.channels=[5,6,7]"],
+    "conv": ["model.channels=[5,6,7]"],
+    "gcnn3": ["model.channels=[5,6,7]"],
+    "monet": ["model.channels=[5,6,7]", "model.rays=3"],
+    "diffusion": ["model.width=12", "model.blocks=2", "neighbourhood.eigenfunctions=20"],
+}
 QUICK = ["optim.epochs=1"]
 SECONDS = {"seconds/preprocess", "seconds/train", "seconds/wait"}
 METRICS = {

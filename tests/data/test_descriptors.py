@@ -6,18 +6,20 @@ import pickle
 
 import numpy as np
 import pytest
+import torch
 
 from meshspiral.data.descriptors import Descriptor, Features
+from meshspiral.data.descriptors.hks import Hks
 from meshspiral.data.descriptors.raw import Raw
 from meshspiral.data.descriptors.shot import Shot
-from meshspiral.data.descriptors.xyz import Xyz
+from meshspiral.data.descriptors.xyz import Xyz, random_rotation
 from meshspiral.data.preprocessing import compute_task, descriptor_task
 from meshspiral.data.settings import ShotSettings
 from meshspiral.experiment.schema import ConfigError
 from meshspiral.geometry.mesh import Mesh
 from tests.geometry.test_sampling import split_faces
 from tests.helpers import composed
-from tests.meshes import bumpy_sphere, lattice, union
+from tests.meshes import bumpy_sphere, icosphere, lattice, union
 
 RAW = Raw(Raw.Settings(radius=0.4, rings=2, rays=5, support=0.8))
 
@@ -74,10 +76,49 @@ def test_raw_geometry_is_undefined_without_a_frame():
 
 
 def test_positions_change_with_the_pose_of_the_mesh_and_not_with_its_unit():
-    mesh, xyz = bumpy_sphere(), Xyz(Xyz.Settings())
+    mesh, xyz = bumpy_sphere(), Xyz(Xyz.Settings(rotate=False))
     scaled = Mesh(5 * mesh.vertices + 3, mesh.faces)
     np.testing.assert_allclose(described(scaled, xyz), described(mesh, xyz), atol=1e-6)
     assert np.abs(described(moved(mesh), xyz) - described(mesh, xyz)).max() > 0.01
+
+
+def test_random_rotations_are_rotations_and_move_a_direction_anywhere():
+    generator = torch.Generator().manual_seed(0)
+    rotations = torch.stack([random_rotation(generator) for _ in range(400)])
+    identity = torch.eye(3, dtype=torch.float64).expand(400, 3, 3)
+    torch.testing.assert_close(rotations @ rotations.mT, identity)
+    assert torch.linalg.det(rotations).min() > 0.99
+    assert rotations.mean(0).abs().max() < 0.1  # of uniform rotations it is 0
+
+
+def test_positions_are_rotated_in_training_on_request_and_other_features_are_not():
+    mesh = bumpy_sphere()
+    for rotate in (False, True):
+        features = Features((RAW, Xyz(Xyz.Settings(rotate=rotate))), 1.0)
+        columns = np.concatenate([described(mesh, each) for each in features.descriptors], axis=1)
+        found = features.drawn(torch.from_numpy(columns), torch.Generator().manual_seed(1)).numpy()
+        np.testing.assert_array_equal(found[:, :-3], columns[:, :-3])
+        assert np.allclose(found[:, -3:], columns[:, -3:]) == (not rotate)
+        lengths = (np.linalg.norm(each[:, -3:], axis=1) for each in (found, columns))
+        np.testing.assert_allclose(*lengths, rtol=1e-5)
+
+
+HKS = Hks(Hks.Settings(times=8, eigenfunctions=40))
+
+
+def test_heat_kernel_signatures_see_neither_motion_nor_unit_nor_reflection():
+    mesh = bumpy_sphere(3, 3)
+    mirrored = Mesh(mesh.vertices * [1, 1, -1], mesh.faces[:, ::-1])
+    for other in (moved(mesh), mirrored):
+        np.testing.assert_allclose(described(other, HKS), described(mesh, HKS), atol=1e-5)
+    apart = np.abs(described(bumpy_sphere(4, 3), HKS) - described(mesh, HKS))
+    assert apart.max() > 100 * 1e-5
+
+
+def test_all_vertices_of_a_sphere_have_the_same_heat_kernel_signature():
+    # with 36 = 1 + 3 + ... + 11 functions, whole eigenspaces
+    hks = Hks(Hks.Settings(times=5, eigenfunctions=36))
+    assert np.abs(described(icosphere(3), hks)).max() < 0.05 / np.sqrt(544)
 
 
 def test_descriptors_stand_side_by_side():
@@ -93,7 +134,7 @@ def test_descriptors_stand_side_by_side():
     [
         (
             "data.features=shott",
-            "must be one of raw, shot, xyz, or a list, got shott",
+            "must be one of hks, raw, shot, xyz, or a list, got shott",
         ),
         ("data.features=[]", "data.features must have at least 1 entry"),
         ("data.raw.rings=0", "data.raw.rings must be at least 1, got 0"),

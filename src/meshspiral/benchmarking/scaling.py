@@ -16,7 +16,7 @@ from meshspiral.experiment.schema import BenchmarkConfig, TrainConfig, load_plug
 from meshspiral.neighbourhoods import Neighbourhood
 from meshspiral.nn.loss import linear_cross_entropy
 from meshspiral.nn.networks import Network
-from meshspiral.nn.networks.base import LAST
+from meshspiral.nn.networks.three_layers import LAST
 from meshspiral.training.device import keep_freed_memory, set_up_process
 
 SIZES = [1500, 3000, 6000, 12_000, 25_000, 50_000, 100_000]

@@ -9,6 +9,7 @@ from itertools import islice
 
 import lightning as L
 import numpy as np
+import torch
 from torch.utils.data import DataLoader
 
 from meshspiral.data.cache import Cache
@@ -18,6 +19,7 @@ from meshspiral.data.prepared import Recipe
 from meshspiral.data.reference import ReferenceDistances
 from meshspiral.data.shapes import SPLITS, DataError, Shape, ShapeSet
 from meshspiral.data.tensors import draw
+from meshspiral.geometry.digest import derived_seed
 from meshspiral.neighbourhoods import Neighbourhood
 from meshspiral.neighbourhoods.base import Batch
 
@@ -156,6 +158,11 @@ class CorrespondenceData(L.LightningDataModule):
     def on_after_batch_transfer(self, batch: Batch, dataloader_idx: int) -> Batch:
         training = self.trainer.training
         when = f"epoch {self.trainer.current_epoch}" if training else "evaluation"
+        if training:
+            purpose = (self.seed, "features", when, batch["index"])
+            generator = torch.Generator(batch["features"].device)
+            generator.manual_seed(derived_seed(*purpose))
+            batch["features"] = self.features.drawn(batch["features"], generator)
         return draw(self.neighbourhood, batch, self.seed, "spirals", when, training=training)
 
     def state_dict(self) -> dict[str, int]:

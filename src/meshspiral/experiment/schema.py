@@ -401,6 +401,8 @@ def upgraded(values: dict[str, Any]) -> dict[str, Any]:
     if isinstance(data.get("shot"), dict):
         data["shot"].setdefault("by_area", False)
     data.setdefault("raw", {"radius": 0.16, "rings": 3, "rays": 8, "support": 0.3})
+    data.setdefault("hks", {"times": 16, "eigenfunctions": 128})
+    data.setdefault("xyz", {"rotate": False})
     if values["neighbourhood"].get("name") == "spiral":
         for key, value in STARTED.items():
             values["neighbourhood"].setdefault(key, value)

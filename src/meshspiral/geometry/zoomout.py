@@ -7,30 +7,23 @@ correspondence" (2019).
 from __future__ import annotations
 
 import numpy as np
-import potpourri3d
-from scipy.sparse import diags_array
-from scipy.sparse.linalg import ArpackError, eigsh
 from scipy.spatial import cKDTree
 
+from meshspiral.geometry.laplacian import spectrum
 from meshspiral.geometry.mesh import Mesh, MeshError
 
 FROM, TO, STEP = 20, 80, 5  # numbers of eigenfunctions: first, last, increment
-ROUNDS = 100  # iterations of ARPACK; a mesh needs a few, one far from a surface would take minutes
 
 
 def eigenfunctions(mesh: Mesh, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """The eigenfunctions of the Laplacian with the smallest eigenvalues.
-
-    The stiffness matrix has cotangent weights, as potpourri3d computes them. The mass of a vertex
-    is a third of the area of its faces, and at least 1e-8 of the mean mass.
+    """The eigenfunctions of the Laplacian with the smallest eigenvalues, and the masses.
 
     Args:
         mesh: The surface.
         count: Number of eigenfunctions.
 
     Returns:
-        The eigenfunctions, float64 [V, count], orthonormal with respect to the masses; and the
-        masses, float64 [V], in the square of the mesh's unit.
+        `functions`, float64 [V, count], and `masses`, float64 [V], of `spectrum`.
 
     Raises:
         MeshError: The mesh has no more than `count` vertices, or ARPACK finds no solution.
@@ -40,23 +33,7 @@ def eigenfunctions(mesh: Mesh, count: int) -> tuple[np.ndarray, np.ndarray]:
             f"{mesh.name}: {count} eigenfunctions need more than {count} vertices, "
             f"got {len(mesh.vertices)}"
         )
-    stiffness = potpourri3d.cotan_laplacian(mesh.vertices, mesh.faces, denom_eps=1e-10)
-    masses = potpourri3d.vertex_areas(mesh.vertices, mesh.faces)
-    masses = np.maximum(masses, 1e-8 * masses.mean())
-    shift = -1e-8 * 4 * np.pi**2 / mesh.area  # just below 0, the least eigenvalue
-    try:
-        _, functions = eigsh(
-            stiffness,
-            k=count,
-            M=diags_array(masses, format="csc"),
-            sigma=shift,
-            v0=np.ones(len(masses)),
-            maxiter=ROUNDS,
-        )
-    except (ArpackError, RuntimeError) as error:
-        raise MeshError(
-            f"{mesh.name}: no eigenfunctions of the Laplacian found ({error})"
-        ) from error
+    _, functions, masses = spectrum(mesh, count)
     return functions, masses
 
 

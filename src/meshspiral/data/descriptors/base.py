@@ -9,6 +9,7 @@ from types import ModuleType
 from typing import Any, ClassVar
 
 import numpy as np
+import torch
 from pydantic import BaseModel, create_model
 
 from meshspiral.data.settings import DataSettings
@@ -67,6 +68,15 @@ class Descriptor(ABC):
             float32 [V, channels], with NaN in rows where the descriptor is undefined.
         """
 
+    def drawn(self, features: torch.Tensor, generator: torch.Generator) -> torch.Tensor:
+        """What an iteration of training reads; by default the features as they are.
+
+        Args:
+            features: float [V, channels], as `compute` returned them, zeros where undefined.
+            generator: For random choices, on the same device.
+        """
+        return features
+
 
 @dataclass(frozen=True, eq=False)
 class Features:
@@ -92,6 +102,15 @@ class Features:
     def channels(self) -> int:
         """Number of channels of all descriptors together."""
         return sum(descriptor.channels for descriptor in self.descriptors)
+
+    def drawn(self, features: torch.Tensor, generator: torch.Generator) -> torch.Tensor:
+        """The features, float [V, channels], as an iteration of training reads them."""
+        columns = features.split([descriptor.channels for descriptor in self.descriptors], dim=1)
+        parts = [
+            descriptor.drawn(part, generator)
+            for descriptor, part in zip(self.descriptors, columns, strict=True)
+        ]
+        return parts[0] if len(parts) == 1 else torch.cat(parts, dim=1)
 
 
 @cache

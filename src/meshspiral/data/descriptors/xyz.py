@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
+import torch
+from pydantic import Field
 
 from meshspiral.data.descriptors.base import Descriptor
+from meshspiral.data.settings import Strict
 from meshspiral.geometry.mesh import Mesh
 
 
@@ -12,10 +15,35 @@ class Xyz(Descriptor, name="xyz"):
     """The position relative to the mean of all vertices, over the square root of the surface area.
 
     Not invariant: it changes when the mesh is rotated. A network that reads positions recognises
-    poses and orientations of the training data.
+    poses and orientations of the training data, unless these are rotated in every iteration.
     """
 
     channels = 3
 
+    class Settings(Strict):
+        rotate: bool = Field(
+            description="rotate each training mesh at random, anew in every iteration"
+        )
+
     def compute(self, mesh: Mesh, frames: np.ndarray | None = None) -> np.ndarray:
         return (mesh.centred / (np.sqrt(544) * mesh.size)).astype(np.float32)
+
+    def drawn(self, features: torch.Tensor, generator: torch.Generator) -> torch.Tensor:
+        if not self.settings.rotate:
+            return features
+        return features @ random_rotation(generator).to(features)
+
+
+def random_rotation(generator: torch.Generator) -> torch.Tensor:
+    """A rotation, uniform among all, float64 [3, 3] (of a random unit quaternion)."""
+    device = generator.device
+    q = torch.randn(4, generator=generator, device=device, dtype=torch.float64)
+    w, *v = q / q.norm()
+    x, y, z = v
+    return torch.stack(
+        [
+            torch.stack([1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)]),
+            torch.stack([2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)]),
+            torch.stack([2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)]),
+        ]
+    )

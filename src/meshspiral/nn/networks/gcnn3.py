@@ -8,10 +8,10 @@ from typing import Any
 from torch import Tensor, nn
 
 from meshspiral.nn.geodesic import GeodesicConv, Resampling
-from meshspiral.nn.networks.base import Network
+from meshspiral.nn.networks.three_layers import ThreeLayerNet
 
 
-class GCNN3(Network, name="gcnn3"):
+class GCNN3(ThreeLayerNet, name="gcnn3"):
     """GCNN3: three geodesic convolutions on polar patches.
 
     Args:

@@ -10,12 +10,12 @@ from torch import Tensor, nn
 
 from meshspiral.nn.geodesic import Resampling, resample
 from meshspiral.nn.layers import metric_features
-from meshspiral.nn.networks.base import Network
+from meshspiral.nn.networks.three_layers import ThreeLayerNet
 
 MetricLayers = Literal["all", "first"]
 
 
-class SpiralNet(Network):
+class SpiralNet(ThreeLayerNet):
     """A network with three layers on sequences of vertices. A subclass implements `spiral_layer`.
 
     Args:
@@ -33,7 +33,7 @@ class SpiralNet(Network):
 
     reads = "spirals"
 
-    class Settings(Network.Settings):
+    class Settings(ThreeLayerNet.Settings):
         metric: bool = Field(description="read metric information: distance and angle")
         metric_layers: MetricLayers = Field(
             description="spiral layers that read metric information: all, or the first alone"

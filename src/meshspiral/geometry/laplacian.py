@@ -1,0 +1,88 @@
+"""The Laplacian of a surface: its eigenvalues and eigenfunctions."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+import potpourri3d
+from scipy.linalg import eigh
+from scipy.sparse import csc_array, diags_array
+from scipy.sparse.linalg import ArpackError, eigsh
+
+from meshspiral.geometry.mesh import Mesh, MeshError
+
+ROUNDS = 100  # iterations of ARPACK; a mesh needs a few, one far from a surface would take minutes
+SMALL = 400  # vertices up to which all eigenfunctions are computed at once, which is faster there
+
+
+class Spectrum(NamedTuple):
+    """The smallest eigenvalues of a surface's Laplacian, and their eigenfunctions.
+
+    Attributes:
+        values: float64 [K], ascending, at least 0, in 1 over the square of the mesh's unit.
+        functions: float64 [V, K], orthonormal with respect to the masses. Signs, and bases of
+            repeated eigenvalues, are arbitrary.
+        masses: float64 [V], in the square of the mesh's unit.
+    """
+
+    values: np.ndarray
+    functions: np.ndarray
+    masses: np.ndarray
+
+
+def laplacian(mesh: Mesh) -> tuple[csc_array, np.ndarray]:
+    """The stiffness matrix with cotangent weights, and the masses of the vertices.
+
+    Args:
+        mesh: The surface.
+
+    Returns:
+        The stiffness matrix, [V, V], positive semi-definite, as potpourri3d computes it; and
+        masses, float64 [V]: a third of the area of the faces of each vertex, and at least 1e-8 of
+        the mean mass.
+
+    Raises:
+        MeshError: The surface has no area.
+    """
+    if mesh.area == 0:
+        raise MeshError(f"{mesh.name}: surface area must be above 0 for a Laplacian, got 0")
+    stiffness = potpourri3d.cotan_laplacian(mesh.vertices, mesh.faces, denom_eps=1e-10)
+    masses = mesh.vertex_areas
+    return csc_array(stiffness), np.maximum(masses, 1e-8 * masses.mean())
+
+
+def spectrum(mesh: Mesh, count: int) -> Spectrum:
+    """The eigenfunctions of the Laplacian with the smallest eigenvalues.
+
+    They solve stiffness f = value * masses f, see `laplacian`.
+
+    Args:
+        mesh: The surface.
+        count: Number of eigenfunctions K; a mesh of fewer vertices has as many as vertices.
+
+    Raises:
+        MeshError: The surface has no area, or ARPACK finds no solution.
+    """
+    stiffness, masses = laplacian(mesh)
+    if len(masses) <= max(SMALL, count + 1):
+        roots = np.sqrt(masses)
+        values, functions = eigh(stiffness.toarray() / np.outer(roots, roots))
+        values, functions = values[:count], (functions / roots[:, None])[:, :count]
+        return Spectrum(np.maximum(values, 0.0), functions, masses)
+    shift = -1e-8 * 4 * np.pi**2 / mesh.area  # just below 0, the least eigenvalue
+    try:
+        values, functions = eigsh(
+            stiffness,
+            k=count,
+            M=diags_array(masses, format="csc"),
+            sigma=shift,
+            v0=np.ones(len(masses)),
+            maxiter=ROUNDS,
+        )
+    except (ArpackError, RuntimeError) as error:
+        raise MeshError(
+            f"{mesh.name}: no eigenfunctions of the Laplacian found ({error})"
+        ) from error
+    order = np.argsort(values)
+    return Spectrum(np.maximum(values[order], 0.0), functions[:, order], masses)
