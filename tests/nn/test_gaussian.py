@@ -124,8 +124,8 @@ def test_chunks_make_no_difference(monkeypatch):
     around, features = disks(), torch.randn(20, 3, dtype=torch.float64, requires_grad=True)
     layer = GaussianMixtureConv(3, 4, 2, 3).double()
     results = []
-    for rows in (2048, 6):
-        monkeypatch.setattr("meshspiral.nn.gaussian.ROWS", rows)
+    for rows in (64, 6):
+        monkeypatch.setattr("meshspiral.nn.gaussian.CACHED_ROWS", rows)
         out = layer(features, around)
         results.append(
             (out, *torch.autograd.grad(out.square().sum(), [features, *layer.parameters()]))

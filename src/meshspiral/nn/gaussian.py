@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from typing import NamedTuple
 
 import torch
@@ -10,6 +11,8 @@ from torch import Tensor, nn
 
 from meshspiral.nn.layers import ROWS, dense
 from meshspiral.nn.precision import product_dtype
+
+CACHED_ROWS = 128  # disks at a time on a processor
 
 
 class Disks(NamedTuple):
@@ -66,59 +69,98 @@ class GaussianMixtureConv(nn.Module):
         Returns:
             float [V, out_features].
         """
-        with torch.autocast(features.device.type, enabled=False):
-            weights = self.weights(disks).to(features.dtype)
-        means = _MeansOfDisks.apply(features, weights, disks.vertices, product_dtype(features))
+        parameters = self.mean_distance, self.mean_angle, self.log_width
+        means = _MeansUnderGaussians.apply(features, *parameters, *disks, product_dtype(features))
         return self.linear(means.flatten(1))
 
     def weights(self, disks: Disks) -> Tensor:
         """The weights of all vertices under all Gaussians, float [V, rings * rays, K]."""
-        dtype = self.mean_distance.dtype
-        distances, angles = (x.to(dtype)[:, None] for x in disks[1:])
-        scale = torch.exp(-self.log_width)[..., None] * 0.5**0.5
-        exponents = ((distances - self.mean_distance[:, None]) * scale[:, 0]).square()
-        turned = angles - self.mean_angle[:, None]
-        turned = turned - 2 * math.pi * torch.round(turned.detach() / (2 * math.pi))
-        exponents = exponents + (turned * scale[:, 1] * (distances > 0)).square()
-        exponents = exponents.masked_fill((disks.vertices < 0)[:, None], math.inf)
-        return torch.softmax(-exponents, dim=2)
+        return _weights(self.mean_distance, self.mean_angle, self.log_width, *disks)[0]
 
 
-class _MeansOfDisks(torch.autograd.Function):
-    """Sums of features over disks, with weights: float [V, J, C].
+class _MeansUnderGaussians(torch.autograd.Function):
+    """Means of the features under the Gaussians, float [V, J, C].
 
-    The gathered features are K times as large as the features, so only ROWS disks are gathered at a
-    time, in both passes.
+    Weights are K / C times as large as the means, and gathered features K / J times. Both are
+    formed for a few disks at a time, in both passes, so that they stay in the processor's cache.
     """
 
     @staticmethod
-    def forward(ctx, features, weights, vertices, dtype):
-        features, weights = features.to(dtype), weights.to(dtype)
-        indices = vertices.clamp(min=0).long()  # a weight of 0 there
-        ctx.save_for_backward(features, weights, indices)
-        out = features.new_empty(*weights.shape[:2], features.shape[1])
-        for start in range(0, len(indices), ROWS):
-            rows = slice(start, start + ROWS)
-            torch.bmm(weights[rows], _gathered(features, indices[rows]), out=out[rows])
+    def forward(ctx, features, mean_distance, mean_angle, log_width, *rest):
+        *disks, dtype = rest
+        features = features.to(dtype)
+        gaussians = mean_distance, mean_angle, log_width
+        ctx.save_for_backward(features, *gaussians, *disks)
+        out = features.new_empty(len(disks[0]), len(mean_distance), features.shape[1])
+        for rows in _chunks(features, len(out)):
+            weights, *_ = _weights(*gaussians, *(x[rows] for x in disks))
+            torch.bmm(weights.to(dtype), _gathered(features, disks[0][rows]), out=out[rows])
         return out
 
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx, grad):
-        features, weights, indices = ctx.saved_tensors
+        features, mean_distance, mean_angle, log_width, *disks = ctx.saved_tensors
+        gaussians = mean_distance, mean_angle, log_width
         grad = grad.to(features.dtype)
         sum_dtype = torch.promote_types(features.dtype, torch.float32)
         d_features = torch.zeros_like(features, dtype=sum_dtype)
-        d_weights = torch.empty_like(weights)
-        for start in range(0, len(indices), ROWS):
-            rows = slice(start, start + ROWS)
-            gathered = _gathered(features, indices[rows])
-            torch.bmm(grad[rows], gathered.mT, out=d_weights[rows])
-            torch.bmm(weights[rows].mT, grad[rows], out=gathered)
-            d_features.index_add_(0, indices[rows].flatten(), gathered.flatten(0, 1).to(sum_dtype))
-        return d_features, d_weights, None, None
+        moments = torch.zeros(len(mean_distance), 4, device=grad.device, dtype=log_width.dtype)
+        for rows in _chunks(features, len(grad)):
+            vertices, distances, angles = (x[rows] for x in disks)
+            weights, offsets, turned = _weights(*gaussians, vertices, distances, angles)
+            gathered = _gathered(features, vertices)
+            d_weights = torch.bmm(grad[rows], gathered.mT).to(weights.dtype)
+            d_exponents = d_weights.mul_(weights)
+            d_exponents -= weights * d_exponents.sum(2, keepdim=True)  # of the softmax
+            for k, offset in ((0, offsets), (2, turned)):
+                product = d_exponents * offset
+                moments[:, k] += product.sum((0, 2))
+                moments[:, k + 1] += product.mul_(offset).sum((0, 2))
+            torch.bmm(weights.to(features.dtype).mT, grad[rows], out=gathered)
+            flat = vertices.clamp(min=0).flatten()
+            d_features.index_add_(0, flat, gathered.flatten(0, 1).to(sum_dtype))
+        # the exponent is -(offset / width)^2 / 2
+        narrow = torch.exp(-2 * log_width)
+        d_log_width = narrow * moments[:, 1::2]
+        d_means = narrow * moments[:, 0::2]
+        return d_features, d_means[:, 0], d_means[:, 1], d_log_width, None, None, None, None
 
 
-def _gathered(features: Tensor, indices: Tensor) -> Tensor:
-    """features[indices], float [rows, K, C]."""
-    return features.index_select(0, indices.flatten()).view(*indices.shape, -1)
+def _chunks(features: Tensor, count: int) -> Iterator[slice]:
+    """Slices of some rows each: those that fit the cache of a processor, or fill a GPU."""
+    size = CACHED_ROWS if features.device.type == "cpu" else ROWS
+    return (slice(start, start + size) for start in range(0, count, size))
+
+
+def _weights(
+    mean_distance: Tensor,
+    mean_angle: Tensor,
+    log_width: Tensor,
+    vertices: Tensor,
+    distances: Tensor,
+    angles: Tensor,
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Weights under J Gaussians, and offsets from their means in distance and in angle.
+
+    Returns:
+        Three float [V, J, K].
+    """
+    dtype = mean_distance.dtype
+    distances, angles = (x.to(dtype)[:, None] for x in (distances, angles))
+    offsets = distances - mean_distance[:, None]
+    turned = angles - mean_angle[:, None]
+    turned -= (turned * (0.5 / math.pi)).round_().mul_(2 * math.pi)
+    turned *= (distances > 0).to(dtype)
+    narrow = torch.exp(-log_width)[..., None] * 0.5**0.5
+    exponents = (offsets * narrow[:, 0]).square_().neg_()
+    exponents -= (turned * narrow[:, 1]).square_()
+    padding = torch.zeros_like(distances).masked_fill_((vertices < 0)[:, None], -math.inf)
+    exponents += padding
+    return torch.softmax(exponents, dim=2), offsets, turned
+
+
+def _gathered(features: Tensor, vertices: Tensor) -> Tensor:
+    """features[vertices], float [rows, K, C]; those of vertex 0 in the place of padding."""
+    flat = vertices.clamp(min=0).flatten()
+    return features.index_select(0, flat).view(*vertices.shape, -1)
