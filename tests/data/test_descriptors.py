@@ -134,7 +134,7 @@ def test_descriptors_stand_side_by_side():
     [
         (
             "data.features=shott",
-            "must be one of hks, raw, shot, xyz, or a list, got shott",
+            "must be one of geovec, hks, raw, shot, xyz, or a list, got shott",
         ),
         ("data.features=[]", "data.features must have at least 1 entry"),
         ("data.raw.rings=0", "data.raw.rings must be at least 1, got 0"),

@@ -21,5 +21,11 @@ def sampled(radius=0.4, rings=2, rays=5, blend=False, relative_to="area", **star
 
 
 def patch(radius=0.1, rings=3, rays=8, weights="interpolation") -> Patch:
-    settings = {"radius": radius, "rings": rings, "rays": rays, "weights": weights}
+    settings = {
+        "radius": radius,
+        "rings": rings,
+        "rays": rays,
+        "weights": weights,
+        "ring_width": 2.0,
+    }
     return Patch(Patch.Settings(name="patch", **settings))

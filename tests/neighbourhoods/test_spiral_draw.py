@@ -18,7 +18,10 @@ from tests.neighbourhoods.made import spiral
 
 
 def tensors_of(mesh, neighbourhood):
-    return {**mesh_tensors(mesh, Features((Xyz(Xyz.Settings()),), 1.0), neighbourhood), "index": 0}
+    return {
+        **mesh_tensors(mesh, Features((Xyz(Xyz.Settings(rotate=False)),), 1.0), neighbourhood),
+        "index": 0,
+    }
 
 
 def drawn_from(neighbourhood, tensors, seed=0, training=False):

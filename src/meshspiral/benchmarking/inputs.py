@@ -7,6 +7,7 @@ import torch
 from lightning.fabric.utilities import move_data_to_device
 
 from meshspiral.data.descriptors import Features
+from meshspiral.data.fitting import fitted_to
 from meshspiral.data.preprocessing import compute_task, neighbourhood_task
 from meshspiral.data.shapes import Shape
 from meshspiral.data.sources import open_shapes
@@ -39,7 +40,8 @@ def body_batch(config: TrainConfig, device: str) -> Batch:
     """The batch of the first training shape, as in training, with nothing drawn yet."""
     shape = first_body(config)
     neighbourhood = Neighbourhood.of(config.neighbourhood)
-    batch = mesh_tensors(shape.mesh, Features.of(config.data), neighbourhood)
+    features = fitted_to(Features.of(config.data), [shape.mesh])
+    batch = mesh_tensors(shape.mesh, features, neighbourhood)
     batch |= {"labels": torch.from_numpy(shape.labels), "index": 0}
     return move_data_to_device(batch, device)
 

@@ -11,6 +11,7 @@ from meshspiral.benchmarking.inputs import first_body
 from meshspiral.benchmarking.measure import Row, medians
 from meshspiral.data.cache import Cache
 from meshspiral.data.descriptors import Features
+from meshspiral.data.fitting import fitted_to
 from meshspiral.data.preprocessing import (
     Task,
     compute_task,
@@ -30,12 +31,12 @@ def preprocessing_rows(config: BenchmarkConfig, networks: list[TrainConfig]) -> 
     The last row is everything for all bodies, with all cores, from an empty cache.
     """
     data, makers = networks[0].data, dict[str, Callable[[Mesh], Task]]()
-    for descriptor in Features.of(data).descriptors:
+    mesh = first_body(networks[0]).mesh
+    for descriptor in fitted_to(Features.of(data), [mesh]).descriptors:
         makers[descriptor.name] = partial(descriptor_task, descriptor=descriptor)
     for network in networks:
         around = Neighbourhood.of(network.neighbourhood)
         makers[around.title] = partial(neighbourhood_task, neighbourhood=around)
-    mesh = first_body(networks[0]).mesh
     tasks = {name: make(mesh) for name, make in makers.items()}
     seconds = medians(
         {name: partial(compute_task, task) for name, task in tasks.items()},

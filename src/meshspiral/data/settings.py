@@ -92,7 +92,8 @@ class DataSettings(Strict):
         description="damage the training shapes as scans are; null: as they are"
     )
     features: Names = Field(
-        min_length=1, description="descriptors, one or a list: shot, raw, hks, xyz (not invariant)"
+        min_length=1,
+        description="descriptors, one or a list: shot, geovec, hks, raw, xyz (not invariant)",
     )
     shot: ShotSettings
     shuffle_vertices: bool = Field(description="renumber the vertices of every mesh at random")

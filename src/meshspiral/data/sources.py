@@ -9,6 +9,7 @@ from meshspiral.data.cache import Cache
 from meshspiral.data.damaged import Damaged
 from meshspiral.data.datamodule import CorrespondenceData
 from meshspiral.data.descriptors import Features
+from meshspiral.data.fitting import fitted_features
 from meshspiral.data.remeshed import Remeshed
 from meshspiral.data.settings import DataSettings
 from meshspiral.data.shapes import ShapeSet
@@ -32,13 +33,22 @@ def open_shapes(settings: DataSettings) -> ShapeSet:
 
 
 def open_data(config: Any) -> CorrespondenceData:
-    """The data module of a whole config, a `TrainConfig`. Raises the errors of `open_shapes`."""
+    """The data module of a whole config, a `TrainConfig`.
+
+    Settings of descriptors that are to be fitted are fitted to its training shapes.
+
+    Raises:
+        DataError: The data set is missing or wrong.
+        MeshError: A mesh cannot be used.
+        CacheError: The cache cannot be written.
+    """
     data = config.data
+    shapes, cache = open_shapes(data), Cache(data.cache_dir)
     return CorrespondenceData(
-        open_shapes(data),
-        Features.of(data),
+        shapes,
+        fitted_features(Features.of(data), shapes, cache, data.workers),
         Neighbourhood.of(config.neighbourhood),
-        Cache(data.cache_dir),
+        cache,
         config.seed,
         data.shuffle_vertices,
         data.workers,

@@ -12,6 +12,7 @@ from typing import Any
 from filelock import FileLock, Timeout
 from omegaconf import DictConfig, OmegaConf
 
+from meshspiral.data.descriptors import Features
 from meshspiral.experiment.run_folder import CONFIG, LAST, RunError, read_run_config, write_config
 from meshspiral.experiment.schema import TrainConfig, flat, read_config
 
@@ -80,10 +81,15 @@ def in_use(folder: Path) -> bool:
 
 
 def differences(config: TrainConfig, stored: TrainConfig) -> list[str]:
-    """The keys in which two configs describe different runs."""
+    """The keys in which two configs describe different runs.
+
+    A setting of a descriptor that is to be fitted does not differ from one that was fitted.
+    """
     one, two = (flat(c.model_dump()) for c in (config, stored))
     keys = [key for key in one.keys() | two.keys() if key != "resume" and not may_change(key)]
-    return sorted(key for key in keys if one.get(key) != two.get(key))
+    fitted = {f"data.{d.name}.{d.fitted}" for d in Features.of(config.data).descriptors}
+    fitted = {key for key in fitted if one.get(key) is None}
+    return sorted(key for key in keys if one.get(key) != two.get(key) and key not in fitted)
 
 
 def resumed_config(config: TrainConfig, overrides: list[str]) -> TrainConfig:

@@ -402,7 +402,11 @@ def upgraded(values: dict[str, Any]) -> dict[str, Any]:
         data["shot"].setdefault("by_area", False)
     data.setdefault("raw", {"radius": 0.16, "rings": 3, "rays": 8, "support": 0.3})
     data.setdefault("hks", {"times": 16, "eigenfunctions": 128})
+    bands = {"channels": 150, "eigenfunctions": 300, "largest": None}
+    data.setdefault("geovec", bands)
     data.setdefault("xyz", {"rotate": False})
+    if values["neighbourhood"].get("name") == "patch":
+        values["neighbourhood"].setdefault("ring_width", 2.0)
     if values["neighbourhood"].get("name") == "spiral":
         for key, value in STARTED.items():
             values["neighbourhood"].setdefault(key, value)

@@ -47,7 +47,12 @@ class WindowTable(NamedTuple):
 
 
 def gaussian_windows(
-    mesh: Mesh, radius: float, rings: int = 5, rays: int = 16, turn: np.ndarray | None = None
+    mesh: Mesh,
+    radius: float,
+    rings: int = 5,
+    rays: int = 16,
+    turn: np.ndarray | None = None,
+    width: float = 2.0,
 ) -> WindowTable:
     """The Gaussian windows of all vertices, each over the vertices within a geodesic radius.
 
@@ -55,7 +60,7 @@ def gaussian_windows(
 
         area(u) * ring_i(u) * ray_j(u),
         ring_0 = 1 / (1 + exp((r - m_0) / (2 m_0))),   m_i = (i + 1/2) * radius / rings,
-        ring_i = exp(-((r - m_i) / (2 radius / rings))^2) for i > 0,
+        ring_i = exp(-((r - m_i) / (width radius / rings))^2) for i > 0,
         ray_j = exp(-(d / r)^2 / 0.01).
 
     Here d is the distance to the ray at t_j = (j + 1/2) 2 pi / rays: r |sin(t - t_j)|, or r if
@@ -74,6 +79,7 @@ def gaussian_windows(
         rays: Number of rays.
         turn: float [V], radians by which the grid of each vertex is turned counter-clockwise. None
             for no turn.
+        width: Of the rings; the authors' published code has 2 in one copy, 0.2 in another.
 
     Returns:
         The table of V * rings * rays samples.
@@ -89,11 +95,13 @@ def gaussian_windows(
     sectors = face_sectors(*surface)
     if turn is not None:
         sectors -= np.repeat(turn, np.diff(first))[:, None]
-    return WindowTable(*_all_windows(*surface, sectors, areas, float(radius), rings, rays))
+    return WindowTable(
+        *_all_windows(*surface, sectors, areas, float(radius), rings, rays, float(width))
+    )
 
 
 @njit(cache=True)
-def _all_windows(vertices, neighbours, first, left, sectors, areas, radius, rings, rays):
+def _all_windows(vertices, neighbours, first, left, sectors, areas, radius, rings, rays, width):
     """The windows of all vertices.
 
     Weights are logarithms until a row is written: far from every vertex they would all be 0.
@@ -101,7 +109,7 @@ def _all_windows(vertices, neighbours, first, left, sectors, areas, radius, ring
     Args:
         vertices, neighbours, first, left, sectors: As in `face_sectors`.
         areas: float64 [V], a third of the area of the faces of each vertex.
-        radius, rings, rays: As in `gaussian_windows`.
+        radius, rings, rays, width: As in `gaussian_windows`.
 
     Returns:
         The arrays of a `WindowTable`.
@@ -125,7 +133,7 @@ def _all_windows(vertices, neighbours, first, left, sectors, areas, radius, ring
         for k in range(size):
             u = disk[k]
             largest = max(largest, areas[u])
-            _rings_and_rays(distance[u], angle[u], radius, log_ring[k], log_ray[k])
+            _rings_and_rays(distance[u], angle[u], radius, width, log_ring[k], log_ray[k])
             distance[u] = np.inf
         for k in range(size):
             log_area[k] = np.log(areas[disk[k]]) if largest > 0 else 0.0
@@ -166,19 +174,20 @@ def _write_row(disk, log_area, log_ring, log_ray, end, indices, weights):
 
 
 @njit(cache=True)
-def _rings_and_rays(r, t, radius, log_ring, log_ray):
+def _rings_and_rays(r, t, radius, width, log_ring, log_ray):
     """Write the logarithms of the normalised ring_i and ray_j of a vertex.
 
     Args:
         r, t: Its distance and angle.
         radius: Of the patch.
+        width: Of the rings.
         log_ring: float64 [rings], written.
         log_ray: float64 [rays], written.
     """
     step = radius / len(log_ring)
     log_ring[0] = -np.logaddexp(0.0, (r - step / 2) / step)
     for i in range(1, len(log_ring)):
-        log_ring[i] = -(((r - (i + 0.5) * step) / (2 * step)) ** 2)
+        log_ring[i] = -(((r - (i + 0.5) * step) / (width * step)) ** 2)
     for j in range(len(log_ray)):
         offset = _wrapped(t - (j + 0.5) * 2 * np.pi / len(log_ray))
         d = np.sin(offset) if abs(offset) < np.pi / 2 else 1.0

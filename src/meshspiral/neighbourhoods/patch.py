@@ -36,6 +36,12 @@ class Patch(Neighbourhood, name="patch"):
             "windows as in the original"
         )
 
+        ring_width: float = Field(
+            gt=0,
+            description="width of a gaussian window over the spacing of the rings; the authors' "
+            "published code has 2 in one copy, 0.2 in another",
+        )
+
         @field_validator("rays")
         @classmethod
         def _even(cls, rays: int) -> int:
@@ -60,7 +66,7 @@ class Patch(Neighbourhood, name="patch"):
         radius = settings.radius * geodesics.diameter(mesh)
         grid = (radius, settings.rings, settings.rays, first_directions(mesh))
         if settings.weights == "gaussian":
-            indices, weights, first = windows.gaussian_windows(mesh, *grid)
+            indices, weights, first = windows.gaussian_windows(mesh, *grid, settings.ring_width)
         else:
             table = patches.geodesic_patches(mesh, *grid)
             whole = table.whole.ravel()

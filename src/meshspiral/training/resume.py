@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from meshspiral.data.descriptors import Features
 from meshspiral.experiment.run_folder import (
     CONFIG,
     METRICS,
@@ -110,7 +111,8 @@ class Progress:
 
 
 def store_changes(folder: Path, config: TrainConfig, progress: Progress | None = None) -> None:
-    """Write what a run folder's config must say from now on: `optim.epochs` and `init`.
+    """Write what a run folder's config must say from now on: `optim.epochs`, `init`, and settings
+    of descriptors that were fitted.
 
     The metrics of a finished run that is trained longer are kept under another name: the run is no
     longer finished.
@@ -119,6 +121,8 @@ def store_changes(folder: Path, config: TrainConfig, progress: Progress | None =
         (folder / METRICS).rename(folder / f"metrics_{progress.earlier}_epochs.json")
     if (folder / CONFIG).exists():
         stored = read_run_config(folder)
-        changed = stored.model_copy(update={"optim": config.optim, "init": config.init})
+        data = Features.of(config.data).settings_in(stored.data)
+        changes = {"optim": config.optim, "init": config.init, "data": data}
+        changed = stored.model_copy(update=changes)
         if changed != stored:
             write_config(folder, changed)

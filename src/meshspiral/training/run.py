@@ -42,6 +42,7 @@ def train(config: TrainConfig, folder: Path) -> dict[str, float]:
     log.info("run folder: %s", folder)
     last = folder / LAST if (folder / LAST).exists() else None
     data = open_data(config)
+    config = config.model_copy(update={"data": data.features.settings_in(config.data)})
     initial = InitialWeights(config, data.in_features) if config.init and last is None else None
     began = time.perf_counter()
     data.prepare()

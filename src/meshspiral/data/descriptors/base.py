@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
 from types import ModuleType
@@ -28,11 +29,13 @@ class Descriptor(ABC):
     Class attributes:
         registered: All descriptors, by name.
         modules: Modules whose source code is part of the cache key, beside the class's own.
+        fitted: Name of a setting that is fitted to the training shapes if it is null, see `fit`.
     """
 
     registered: ClassVar[dict[str, type[Descriptor]]] = {}
     name: ClassVar[str]
     modules: ClassVar[tuple[ModuleType, ...]] = ()
+    fitted: ClassVar[str | None] = None
 
     class Settings(BaseModel, extra="forbid", strict=True, frozen=True):
         """The settings `data.<name>`. Those of a plugin need default values."""
@@ -68,6 +71,24 @@ class Descriptor(ABC):
             float32 [V, channels], with NaN in rows where the descriptor is undefined.
         """
 
+    @property
+    def unfitted(self) -> bool:
+        """Whether `fit` must be called before `compute`."""
+        return self.fitted is not None and getattr(self.settings, self.fitted) is None
+
+    def measure(self, mesh: Mesh) -> np.ndarray:
+        """What `fit` needs to know of a training shape, of any shape and dtype."""
+        raise NotImplementedError
+
+    def fit(self, measured: Sequence[np.ndarray]) -> Any:
+        """The value of the setting `fitted`, from `measure` of all training shapes."""
+        raise NotImplementedError
+
+    def with_fitted(self, measured: Sequence[np.ndarray]) -> Descriptor:
+        """The same descriptor with its setting fitted."""
+        value = self.fit(measured)
+        return type(self)(self.settings.model_copy(update={self.fitted: value}))
+
     def drawn(self, features: torch.Tensor, generator: torch.Generator) -> torch.Tensor:
         """What an iteration of training reads; by default the features as they are.
 
@@ -97,6 +118,11 @@ class Features:
             Descriptor.registered[name](getattr(data, name, None)) for name in data.features
         )
         return Features(tuple(descriptors), data.shot.radius)
+
+    def settings_in(self, data: DataSettings) -> DataSettings:
+        """The settings of a data set with those of these descriptors, which may be fitted."""
+        own = {d.name: d.settings for d in self.descriptors if d.fitted}
+        return data.model_copy(update=own) if own else data
 
     @property
     def channels(self) -> int:
