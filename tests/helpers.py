@@ -25,6 +25,13 @@ SMALL = {  # overrides that make each network small
     "lstm": ["model.channels=[5,6,7]"],
     "conv": ["model.channels=[5,6,7]"],
     "gcnn3": ["model.channels=[5,6,7]"],
+    "acnn": [
+        "model.lifted=5",
+        "model.channels=[5,6,7]",
+        "model.dense=[9,8]",
+        "neighbourhood.times=[24.0,60.0]",
+        "neighbourhood.angles=4",
+    ],
     "monet": ["model.channels=[5,6,7]", "model.rays=3"],
     "diffusion": ["model.width=12", "model.blocks=2", "neighbourhood.eigenfunctions=20"],
 }

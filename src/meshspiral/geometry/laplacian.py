@@ -39,23 +39,32 @@ def laplacian(mesh: Mesh) -> tuple[csc_array, np.ndarray]:
 
     Returns:
         The stiffness matrix, [V, V], positive semi-definite, as potpourri3d computes it; and
-        masses, float64 [V]: a third of the area of the faces of each vertex, and at least 1e-8 of
-        the mean mass.
+        `masses_of` the mesh.
+
+    Raises:
+        MeshError: The surface has no area.
+    """
+    masses = masses_of(mesh)
+    stiffness = potpourri3d.cotan_laplacian(mesh.vertices, mesh.faces, denom_eps=1e-10)
+    return csc_array(stiffness), masses
+
+
+def masses_of(mesh: Mesh) -> np.ndarray:
+    """A third of the area of the faces of each vertex, and at least 1e-8 of the mean.
+
+    Returns:
+        float64 [V], in the square of the mesh's unit.
 
     Raises:
         MeshError: The surface has no area.
     """
     if mesh.area == 0:
         raise MeshError(f"{mesh.name}: surface area must be above 0 for a Laplacian, got 0")
-    stiffness = potpourri3d.cotan_laplacian(mesh.vertices, mesh.faces, denom_eps=1e-10)
-    masses = mesh.vertex_areas
-    return csc_array(stiffness), np.maximum(masses, 1e-8 * masses.mean())
+    return np.maximum(mesh.vertex_areas, 1e-8 * mesh.vertex_areas.mean())
 
 
 def spectrum(mesh: Mesh, count: int) -> Spectrum:
     """The eigenfunctions of the Laplacian with the smallest eigenvalues.
-
-    They solve stiffness f = value * masses f, see `laplacian`.
 
     Args:
         mesh: The surface.
@@ -65,9 +74,25 @@ def spectrum(mesh: Mesh, count: int) -> Spectrum:
         MeshError: The surface has no area, or ARPACK finds no solution.
     """
     stiffness, masses = laplacian(mesh)
+    return eigenfunctions_of(mesh, stiffness, masses, count)
+
+
+def eigenfunctions_of(mesh: Mesh, stiffness: csc_array, masses: np.ndarray, count: int) -> Spectrum:
+    """The solutions of stiffness f = value * masses f with the smallest values.
+
+    Args:
+        mesh: The surface, for its area and for messages.
+        stiffness: [V, V], positive semi-definite.
+        masses: float64 [V], above 0.
+        count: Number of solutions K; at most V are returned.
+
+    Raises:
+        MeshError: ARPACK finds no solution.
+    """
     if len(masses) <= max(SMALL, count + 1):
         roots = np.sqrt(masses)
-        values, functions = eigh(stiffness.toarray() / np.outer(roots, roots))
+        matrix = stiffness.toarray() / np.outer(roots, roots)
+        values, functions = eigh(matrix, driver="evd", check_finite=False)
         values, functions = values[:count], (functions / roots[:, None])[:, :count]
         return Spectrum(np.maximum(values, 0.0), functions, masses)
     shift = -1e-8 * 4 * np.pi**2 / mesh.area  # just below 0, the least eigenvalue

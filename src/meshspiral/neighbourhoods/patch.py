@@ -54,6 +54,11 @@ class Patch(Neighbourhood, name="patch"):
         grid = self.settings
         return f"patches of {grid.rings} x {grid.rays} samples, radius {grid.radius} diameters"
 
+    @property
+    def grid(self) -> tuple[int, int]:
+        """Numbers of rings and rays, for networks that read patches."""
+        return self.settings.rings, self.settings.rays
+
     def compute(self, mesh: Mesh) -> Arrays:
         """The samples as a sparse matrix [V * rays * rings, V] in rows.
 

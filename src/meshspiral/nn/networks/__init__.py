@@ -6,6 +6,7 @@ Importing the package registers every class of this folder.
 import importlib
 import pkgutil
 
+from meshspiral.nn.networks.acnn import ACNN
 from meshspiral.nn.networks.base import Network
 from meshspiral.nn.networks.conv import ConvNet
 from meshspiral.nn.networks.diffusion import DiffusionNet
@@ -15,7 +16,17 @@ from meshspiral.nn.networks.lstm import LSTMNet
 from meshspiral.nn.networks.monet import MoNet
 from meshspiral.nn.networks.spiral_net import SpiralNet
 
-__all__ = ["GCNN3", "ConvNet", "DiffusionNet", "FCSNet", "LSTMNet", "MoNet", "Network", "SpiralNet"]
+__all__ = [
+    "ACNN",
+    "GCNN3",
+    "ConvNet",
+    "DiffusionNet",
+    "FCSNet",
+    "LSTMNet",
+    "MoNet",
+    "Network",
+    "SpiralNet",
+]
 
 for _module in pkgutil.iter_modules(__path__):
     importlib.import_module(f"{__name__}.{_module.name}")

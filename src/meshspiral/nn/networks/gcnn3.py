@@ -42,7 +42,7 @@ class GCNN3(ThreeLayerNet, name="gcnn3"):
 
     @classmethod
     def options(cls, neighbourhood: Any) -> dict[str, Any]:
-        return {"rings": neighbourhood.settings.rings, "rays": neighbourhood.settings.rays}
+        return dict(zip(("rings", "rays"), neighbourhood.grid, strict=True))
 
     def layer(self, i: int, in_features: int, out_features: int) -> nn.Module:
         return GeodesicConv(in_features, out_features, self.rings, self.rays)
