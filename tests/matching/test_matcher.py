@@ -268,3 +268,15 @@ def test_a_damaged_file_gives_labels_or_one_message(matchers, tmp_path, seed, re
     low, high = TEMPLATE.vertices.min(axis=0) - 1e-6, TEMPLATE.vertices.max(axis=0) + 1e-6
     assert ((labels.points[known] >= low) & (labels.points[known] <= high)).all()
     assert ((labels.confidence >= 0) & (labels.confidence <= 1)).all()
+
+
+@pytest.mark.parametrize(
+    "options, message",
+    [
+        ({"refine": "zoom"}, "refine must be one of .*'crf', 'zoomout'.*, got 'zoom'"),
+        ({"scale": 0.0}, "scale must be positive and finite, got 0.0"),
+    ],
+)
+def test_wrong_options_are_refused(options, message):
+    with pytest.raises(ValueError, match=message):
+        Matcher.load(**options)

@@ -11,6 +11,8 @@ from scipy.sparse import csc_array
 from meshspiral.geometry.laplacian import eigenfunctions_of, masses_of
 from meshspiral.geometry.mesh import Mesh
 
+ROWS = 1024  # rows of a kernel at a time
+
 
 class KernelTable(NamedTuple):
     """The largest entries of every vertex's kernels.
@@ -109,13 +111,24 @@ def anisotropic_kernels(
         values, functions, _ = eigenfunctions_of(mesh, stiffness, masses, number)
         functions = functions.astype(np.float32)
         for t, time in enumerate(times):
-            kernel = (functions * np.exp(-values * time).astype(np.float32)) @ functions.T
-            norms = np.sqrt(np.abs(kernel).sum(axis=1))
-            norms[isolated] = np.inf
-            best = np.argpartition(-kernel, entries - 1, axis=1)[:, :entries]
-            found = np.take_along_axis(kernel, best, axis=1)
-            order = np.argsort(-found, axis=1, kind="stable")
-            table.indices[:, t, a] = np.take_along_axis(best, order, axis=1)
-            sorted_ = np.take_along_axis(found, order, axis=1)
-            table.weights[:, t, a] = sorted_ / norms[:, None]
+            decayed = functions * np.exp(-values * time).astype(np.float32)
+            for start in range(0, count, ROWS):
+                rows = slice(start, start + ROWS)
+                kernel = decayed[rows] @ functions.T
+                table.indices[rows, t, a], table.weights[rows, t, a] = _largest(kernel, entries)
+    table.weights[isolated] = 0.0
     return table
+
+
+def _largest(kernel: np.ndarray, entries: int) -> tuple[np.ndarray, np.ndarray]:
+    """The largest entries of each row, over the square root of the row's L1 norm.
+
+    Returns:
+        Columns, int [R, entries], and values, float32 [R, entries], descending.
+    """
+    best = np.argpartition(-kernel, entries - 1, axis=1)[:, :entries]
+    found = np.take_along_axis(kernel, best, axis=1)
+    order = np.argsort(-found, axis=1, kind="stable")
+    norms = np.sqrt(np.abs(kernel).sum(axis=1, keepdims=True))
+    found = np.take_along_axis(found, order, axis=1) / norms
+    return np.take_along_axis(best, order, axis=1), found

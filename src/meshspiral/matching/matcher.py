@@ -39,6 +39,7 @@ from meshspiral.matching.mean_field import MeanField, likeliest_near
 from meshspiral.training.checkpoints import BUNDLED_RUN, config_of, read_checkpoint, template_of
 from meshspiral.training.predictor import Predictor
 
+REFINEMENTS = (None, "crf", "zoomout")
 MESH_STAGES = ("size", "resampling", "descriptors", "neighbourhoods", "network", "refinement")
 Report = Callable[[str], None]  # is told each stage when it begins; not every mesh has all
 FACTORS = (1.0, 1.1, 1.2, 1.3, 1.45, 1.6, 1.8, 2.1, 2.5)  # tried for the size of an open surface
@@ -124,6 +125,10 @@ class Matcher:
         refine: str | None = None,
         scale: float | None = None,
     ):
+        if refine not in REFINEMENTS:
+            raise ValueError(f"refine must be one of {REFINEMENTS}, got {refine!r}")
+        if scale is not None and not (np.isfinite(scale) and scale > 0):
+            raise ValueError(f"scale must be positive and finite, got {scale}")
         self.template = template_of(saved)
         self.up = saved["up"]
         self._training_size = int(saved["resolution"])  # vertices of a training mesh
@@ -144,6 +149,7 @@ class Matcher:
         Raises:
             RunError: The checkpoint is missing or damaged, has no template, or needs a plugin.
             ConfigError: There is no GPU.
+            ValueError: `refine` is unknown, or `scale` is not positive.
         """
         folder = Path(run or BUNDLED_RUN)
         saved = read_checkpoint(folder / BEST)

@@ -14,6 +14,7 @@ from meshspiral.neighbourhoods.base import Arrays, Neighbourhood
 from meshspiral.neighbourhoods.patch import by_rows_and_columns
 
 DIAMETER = 200.0  # of a shape in the unit of the times
+ALL, SOME = 2000, 300  # vertices up to which all eigenfunctions are taken, and how many else
 
 
 class Anisotropic(Neighbourhood, name="anisotropic"):
@@ -39,7 +40,9 @@ class Anisotropic(Neighbourhood, name="anisotropic"):
         entries: int = Field(ge=1, description="vertices that a kernel keeps")
         smoothing: int = Field(ge=0, description="averagings of the curvature over one-rings")
         eigenfunctions: int | None = Field(
-            ge=2, description="eigenfunctions of each kernel; null: all, which is exact"
+            ge=2,
+            description="eigenfunctions of each kernel; null: all of a mesh of up to 2,000 "
+            "vertices, which is exact, and 300 of a larger one",
         )
 
         @field_validator("times")
@@ -70,6 +73,7 @@ class Anisotropic(Neighbourhood, name="anisotropic"):
         """The kernels, `indices` int32 and `weights` float32 [V, A, T, K], see `KernelTable`."""
         own = self.settings
         unit = geodesics.diameter(mesh) / DIAMETER
+        count = own.eigenfunctions or (None if len(mesh.vertices) <= ALL else SOME)
         scaled = Mesh(mesh.vertices / unit, mesh.faces, mesh.name)
         tensors = curvature.curvature_tensors(scaled, own.smoothing)
         directions = curvature.principal_directions(scaled, tensors)
@@ -80,7 +84,7 @@ class Anisotropic(Neighbourhood, name="anisotropic"):
             own.angles,
             own.anisotropy,
             own.entries,
-            own.eigenfunctions,
+            count,
         )
         return {
             name: np.ascontiguousarray(array.transpose(0, 2, 1, 3))
