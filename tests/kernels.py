@@ -2,7 +2,7 @@
 
     python -m tests.kernels
 
-For numbers of eigenfunctions, prints seconds for one body, and the share of the kernels' kept entries
+For numbers of eigenfunctions, prints seconds for one body, and the share of the kernels' entries
 that are those of all eigenfunctions.
 """
 

@@ -14,7 +14,7 @@ from meshspiral.commands.match import main
 from meshspiral.data.datasets.bodies import Bodies
 from meshspiral.geometry.barycentric import interpolate
 from meshspiral.matching.confidence import Distributions
-from meshspiral.matching.export import dense_map
+from meshspiral.matching.dense import dense_map
 from meshspiral.matching.job import LabelledScan
 from meshspiral.matching.matcher import Labels
 from meshspiral.matching.morph import morph_glb

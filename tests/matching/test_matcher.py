@@ -162,6 +162,15 @@ def test_only_zoomout_needs_a_complete_surface(trained):
 # ------------------------------------------------------------------------------------------ size
 
 
+def test_with_a_height_radii_are_in_proportion_to_it(trained):
+    matcher = Matcher.load(trained)
+    tall = np.ptp(matcher.template.vertices[:, "xyz".index(matcher.up)])
+    for factor in (1.0, 1.3, 1000.0):
+        matcher = Matcher.load(trained, height=factor * tall)
+        sized = matcher._sized(upper_half(), lambda stage: None)
+        assert sized.size == pytest.approx(factor * TEMPLATE.size)
+
+
 def upper_half() -> Mesh:
     keep = SOURCE.vertices[:, 2] > np.median(SOURCE.vertices[:, 2])
     return SOURCE.with_faces(SOURCE.faces[keep[SOURCE.faces].all(axis=1)])
@@ -274,6 +283,8 @@ def test_a_damaged_file_gives_labels_or_one_message(matchers, tmp_path, seed, re
     "options, message",
     [
         ({"refine": "zoom"}, "refine must be one of .*'crf', 'zoomout'.*, got 'zoom'"),
+        ({"scale": 1.0, "height": 1.7}, "give scale or height, not both"),
+        ({"height": -1.0}, "height must be positive and finite, got -1.0"),
         ({"scale": 0.0}, "scale must be positive and finite, got 0.0"),
     ],
 )

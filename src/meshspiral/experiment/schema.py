@@ -194,6 +194,11 @@ class MatchConfig(Settings):
         description="metres in a unit of the meshes, 0.001 for millimetres; null: radii follow "
         "from the surface area, or from the size at which the network is surest",
     )
+    height: float | None = Field(
+        gt=0,
+        description="instead of scale: how tall the people of all meshes are when they stand, in "
+        "the unit of the meshes",
+    )
     transfer: Text | None = Field(
         description="carry color, uv, or a .npy array [V, ...] of the target to the source"
     )
@@ -225,6 +230,8 @@ class MatchConfig(Settings):
             raise ValueError(f"export={needy[0]} relates to the target; give target=")
         if self.smooth and self.refine not in (None, "zoomout"):
             raise ValueError(f"smooth=true is refine=zoomout; it excludes refine={self.refine}")
+        if self.scale is not None and self.height is not None:
+            raise ValueError(f"give scale={self.scale:g} or height={self.height:g}, not both")
         if self.transfer and not self.target:
             raise ValueError("transfer= carries values of the target to the source; give target=")
         return self

@@ -12,11 +12,11 @@ import trimesh
 from meshspiral.data.files import write_arrays, write_file
 from meshspiral.geometry.barycentric import interpolate
 from meshspiral.geometry.mesh import Mesh
-from meshspiral.geometry.remesh import closest_points
-from meshspiral.matching.job import FileMatch, LabelledScan
+from meshspiral.matching.dense import dense_map
+from meshspiral.matching.job import FileMatch
 from meshspiral.matching.morph import morph_glb
 from meshspiral.matching.pictures import align_to_template, own_colors
-from meshspiral.matching.registration import registered, spanning_faces
+from meshspiral.matching.registration import registered
 from meshspiral.viz.render import upright
 
 EXPORT_FILES = ("dense.npz", "dense.csv", "registered.ply", "morph.glb")
@@ -43,30 +43,6 @@ def write_exports(
         write_file(folder / "registered.ply", mesh.export(file_type="ply"))
     if "morph" in kinds:
         write_file(folder / "morph.glb", morph_of(match, template, up))
-
-
-def dense_map(
-    source: LabelledScan, target: LabelledScan, template: Mesh
-) -> tuple[np.ndarray, np.ndarray]:
-    """For every source vertex a point in a face of the target: where the labels are nearest.
-
-    Faces of the target whose labels do not span a face are left out, see `spanning_faces`.
-
-    Returns:
-        Vertices of the target's faces, int64 [V, 3], -1 for none; and barycentric coordinates,
-        float64 [V, 3].
-    """
-    points, mesh = target.on_mesh(target.labels.points), target.scan.mesh
-    sound = spanning_faces(points, mesh.faces, template)
-    count = len(source.labels.template)
-    found, weights = np.full((count, 3), -1), np.zeros((count, 3))
-    known = source.labels.template >= 0
-    if sound.any() and known.any():
-        spanned = Mesh(np.nan_to_num(points), mesh.faces[sound])
-        queries = source.labels.points[known]
-        face, weights[known], _ = closest_points(spanned, queries, np.full_like(queries, np.nan))
-        found[known] = target.scan.origin[spanned.faces[face]]
-    return found, weights
 
 
 def write_dense(match: FileMatch, template: Mesh, folder: Path) -> None:

@@ -86,6 +86,7 @@ class MatchJob:
             smooth=self.config.smooth,
             refine=self.config.refine,
             scale=self.config.scale,
+            height=self.config.height,
         )
 
     @cached_property
@@ -159,7 +160,7 @@ class MatchJob:
         config = self.config
         files = [str(Path(config.run or BUNDLED_RUN) / BEST), *self.inputs]
         settings = config.repair, config.resample, config.transfer, self.render
-        settings += config.refine, config.smooth, config.scale, str(config.export)
+        settings += config.refine, config.smooth, config.scale, config.height, str(config.export)
         return digest(*map(_content, files), *settings, CONTENT)
 
 

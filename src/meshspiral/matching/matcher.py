@@ -105,6 +105,8 @@ class Matcher:
         scale: Length of one unit of the meshes in the template's unit; the bundled template is in
             metres. Radii are then those of a body of the template's size. None: they follow from
             the surface area; if a mesh has large holes, the size is sought, see `surest_size`.
+        height: Instead of `scale`: how tall the complete shapes are when they stand as the template
+            does, in the unit of the meshes. Radii follow in proportion.
 
     Attributes:
         template: The mesh whose vertices and points are the labels.
@@ -124,15 +126,21 @@ class Matcher:
         smooth: bool = False,
         refine: str | None = None,
         scale: float | None = None,
+        height: float | None = None,
     ):
         if refine not in REFINEMENTS:
             raise ValueError(f"refine must be one of {REFINEMENTS}, got {refine!r}")
-        if scale is not None and not (np.isfinite(scale) and scale > 0):
-            raise ValueError(f"scale must be positive and finite, got {scale}")
+        for name, value in (("scale", scale), ("height", height)):
+            if value is not None and not (np.isfinite(value) and value > 0):
+                raise ValueError(f"{name} must be positive and finite, got {value}")
+        if scale is not None and height is not None:
+            raise ValueError(f"give scale or height, not both, got {scale} and {height}")
         self.template = template_of(saved)
         self.up = saved["up"]
         self._training_size = int(saved["resolution"])  # vertices of a training mesh
         self._resampled, self._scale = resampled, scale
+        if height is not None:
+            self._scale = np.ptp(self.template.vertices[:, "xyz".index(self.up)]) / height
         self._refine = "zoomout" if smooth else refine
         self._features = Features.of(config.data)
         self._predictor = Predictor(saved, config, accelerator, calibrated=True)
@@ -144,12 +152,13 @@ class Matcher:
         Args:
             run: The run folder; only checkpoints/best.ckpt is read. None: the bundled network,
                 trained on human bodies.
-            **options: `accelerator`, `resampled`, `smooth`, `refine` and `scale` of the class.
+            **options: `accelerator`, `resampled`, `smooth`, `refine`, `scale` and `height` of the
+                class.
 
         Raises:
             RunError: The checkpoint is missing or damaged, has no template, or needs a plugin.
             ConfigError: There is no GPU.
-            ValueError: `refine` is unknown, or `scale` is not positive.
+            ValueError: `refine` is unknown; `scale` or `height` is not positive, or both are given.
         """
         folder = Path(run or BUNDLED_RUN)
         saved = read_checkpoint(folder / BEST)

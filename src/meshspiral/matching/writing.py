@@ -12,7 +12,8 @@ import trimesh
 from meshspiral.data.files import write_arrays, write_file
 from meshspiral.data.scans import Scan
 from meshspiral.data.shapes import DataError
-from meshspiral.geometry.mesh import MeshError
+from meshspiral.geometry.mesh import Mesh, MeshError
+from meshspiral.matching.dense import carried
 from meshspiral.matching.export import EXPORT_FILES, write_exports
 from meshspiral.matching.job import FileMatch, MatchJob
 from meshspiral.matching.pictures import draw_pictures, own_colors
@@ -67,7 +68,7 @@ def write_match(job: MatchJob, match: FileMatch, folder: Path) -> None:
     write_file(folder / "remarks.txt", "\n".join(remark_lines(match)) + "\n")
     write_colored_mesh(folder / "source.ply", scan, colors, match.source_confidence)
     if job.transfer_values is not None:
-        values = transfer(job.transfer_values, match.map, 0)
+        values = carried_values(job.transfer_values, match, template, job.config.transfer)
         write_transferred(folder, scan, values, job.config.transfer)
     write_exports(job.config.export, match, template, job.matcher.up, folder)
     if job.render or not job.config.sources:
@@ -173,6 +174,28 @@ def write_colored_mesh(path: Path, scan: Scan, colors: np.ndarray, confidence: n
     mesh = _user_mesh(scan, vertex_colors=np.round(255 * colors).astype(np.uint8))
     mesh.vertex_attributes["confidence"] = confidence
     write_file(path, mesh.export(file_type="ply"))
+
+
+def carried_values(values: np.ndarray, match: FileMatch, template: Mesh, kind: str) -> np.ndarray:
+    """The target's values on the source: interpolated in faces if that makes sense.
+
+    Args:
+        values: [W, ...], one row per target vertex.
+        match: With a target.
+        template: The template of the labels.
+        kind: What is transferred, as `transfer=` says. Colours and floating-point numbers are
+            interpolated; whole numbers and truth values, which may be names of parts, are those of
+            the nearest vertex.
+
+    Returns:
+        [V, ...], with the dtype of `values`.
+    """
+    if kind != "color" and not np.issubdtype(values.dtype, np.floating):
+        return transfer(values, match.map, 0)
+    rows = carried(values.reshape(len(values), -1).astype(np.float64), match, template)
+    if kind == "color":
+        rows = np.round(rows)
+    return rows.reshape(-1, *values.shape[1:]).astype(values.dtype)
 
 
 def write_transferred(folder: Path, scan: Scan, values: np.ndarray, kind: str) -> None:
