@@ -110,6 +110,10 @@ def test_the_root_setting_metric_overrides_model_metric():
         (["+metrics=true"], "unknown key metrics; did you mean metric?"),
         (["+rate=1"], "unknown key rate; known: seq_len"),
         (["metrics=true"], "unknown setting metrics; did you mean metric?"),
+        (
+            ["model=gcnn3", "model.metric=true"],
+            "model.metric is a setting of other options of model than the chosen one",
+        ),
         (["modell=lstm"], "unknown setting modell; did you mean model?"),
         (["optim.lrr=1"], "unknown setting optim.lrr; did you mean optim.lr?"),
         (["xyz=1"], "unknown setting xyz; python -m src.train --help lists them"),

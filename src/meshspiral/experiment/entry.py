@@ -155,7 +155,14 @@ def unknown_setting(command: str, error: BaseException) -> str | None:
     unknown = re.search(r"Could not override '[+~]*([^']+)'", str(error))
     if unknown is None or any(unknown[1].startswith(old) for old in MOVED):
         return None
-    close = difflib.get_close_matches(unknown[1], known_keys(command), n=1)
+    known = known_keys(command)
+    if unknown[1] in known:
+        group = unknown[1].partition(".")[0]
+        return (
+            f"{unknown[1]} is a setting of other options of {group} than the chosen one; "
+            f"{command_line(command)} --help says of which"
+        )
+    close = difflib.get_close_matches(unknown[1], known, n=1)
     hint = f"did you mean {close[0]}?" if close else f"{command_line(command)} --help lists them"
     return f"unknown setting {unknown[1]}; {hint}"
 
