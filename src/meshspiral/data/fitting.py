@@ -2,20 +2,17 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
 
 import numpy as np
 
-from meshspiral.data.cache import Cache, code_version
+from meshspiral.data.cache import Cache
 from meshspiral.data.descriptors import Descriptor, Features
 from meshspiral.data.pool import run_all
-from meshspiral.data.preprocessing import Task, load_task, sources
+from meshspiral.data.preprocessing import load_task, measure_task
 from meshspiral.data.shapes import ShapeSet
-from meshspiral.geometry import mesh as meshes
-from meshspiral.geometry.digest import digest
 from meshspiral.geometry.mesh import Mesh
 
 
@@ -59,17 +56,4 @@ def fitted_to(features: Features, meshes: Sequence[Mesh]) -> Features:
 
 def measure_shape(descriptor: Descriptor, shapes: ShapeSet, cache: Cache, name: str) -> np.ndarray:
     """What an unfitted descriptor measures of a shape, through the cache."""
-    mesh = shapes.load(name).mesh
-    key = digest(
-        repr(sorted(descriptor.settings.model_dump().items())),
-        mesh.vertices,
-        mesh.faces,
-        mesh.whole,
-        code_version(*descriptor.modules, *sources(descriptor), meshes, sys.modules[__name__]),
-    )
-    task = Task(f"{descriptor.name}-fit", key, partial(_measured, descriptor), (mesh,))
-    return load_task(task, cache)["measured"]
-
-
-def _measured(descriptor: Descriptor, mesh: Mesh) -> dict[str, np.ndarray]:
-    return {"measured": descriptor.measure(mesh)}
+    return load_task(measure_task(shapes.load(name).mesh, descriptor), cache)["measured"]

@@ -45,16 +45,26 @@ def frame_task(mesh: Mesh, frame: Frame) -> Task:
 def descriptor_task(mesh: Mesh, descriptor: Descriptor, half: bool = False) -> Task:
     """A descriptor: `features` float32 [V, C], zeros where it is undefined, and `undefined`, the
     number of such vertices. With `half`, features are float16."""
-    key = digest(
-        *(["float16"] if half else []),
+    key = _descriptor_key(mesh, descriptor, *(["float16"] if half else []))
+    compute = partial(_described, descriptor, np.float16 if half else np.float32)
+    return Task(descriptor.name, key, compute, _inputs(descriptor, mesh))
+
+
+def measure_task(mesh: Mesh, descriptor: Descriptor) -> Task:
+    """What an unfitted descriptor measures of a training shape: `measured`."""
+    key = _descriptor_key(mesh, descriptor)
+    return Task(f"{descriptor.name}-fit", key, partial(_measured, descriptor), (mesh,))
+
+
+def _descriptor_key(mesh: Mesh, descriptor: Descriptor, *more: str) -> str:
+    return digest(
+        *more,
         repr(sorted(descriptor.settings.model_dump().items())),
         mesh.vertices,
         mesh.faces,
         mesh.whole,
         code_version(*descriptor.modules, *sources(descriptor), meshes, sys.modules[__name__]),
     )
-    compute = partial(_described, descriptor, np.float16 if half else np.float32)
-    return Task(descriptor.name, key, compute, _inputs(descriptor, mesh))
 
 
 def neighbourhood_task(mesh: Mesh, neighbourhood: Neighbourhood) -> Task:
@@ -95,6 +105,10 @@ def _described(
     undefined = np.isnan(features).any(axis=1)
     features[undefined] = 0.0
     return {"features": features.astype(dtype, copy=False), "undefined": np.array(undefined.sum())}
+
+
+def _measured(descriptor: Descriptor, mesh: Mesh) -> Arrays:
+    return {"measured": descriptor.measure(mesh)}
 
 
 def _check_area(mesh: Mesh) -> None:
