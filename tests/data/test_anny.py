@@ -8,6 +8,7 @@ import pickle
 import numpy as np
 import pytest
 
+from meshspiral.data.datasets import anny as module
 from meshspiral.data.datasets.anny import AGES, Anny, Surface, draw_person
 from meshspiral.data.datasets.bodies import Bodies
 from meshspiral.data.shapes import DataError
@@ -64,6 +65,21 @@ def test_without_anny_one_line_says_how_to_get_it(monkeypatch):
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None if name == "anny" else True)
     with pytest.raises(DataError, match=r"data=anny needs anny: pip install -e '\.\[anny\]'"):
         Anny(1500, 2, 3, "adults", 0)
+
+
+def test_later_epochs_show_other_people(people, monkeypatch):
+    shapes = people()
+    drawn = []
+    monkeypatch.setattr(module, "draw_person", lambda rng, ages: drawn.append(rng.random()) or {})
+    monkeypatch.setattr(module, "body_model", no_model)
+    for name in ("train_0000_01", "train_0001_02", "train_0000_01@1", "train_0000_02@1"):
+        with pytest.raises(KeyError, match="no model"):
+            shapes.load(name)
+    assert drawn[2] == drawn[3] and len(set(drawn)) == 3  # person 2 is not among the first two
+
+
+def no_model():
+    raise KeyError("no model")
 
 
 @installed

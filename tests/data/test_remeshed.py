@@ -12,7 +12,14 @@ from meshspiral.data import preprocessing
 from meshspiral.data.cache import Cache
 from meshspiral.data.pool import run_in_pool
 from meshspiral.data.remeshed import Remeshed, usual_size
-from meshspiral.data.shapes import DataError, Shape, ShapeSet, SurfacePoints, registered_shape
+from meshspiral.data.shapes import (
+    DataError,
+    Shape,
+    ShapeSet,
+    SurfacePoints,
+    name_in,
+    registered_shape,
+)
 from meshspiral.evaluation.outcome import Outcome
 from meshspiral.experiment.run_folder import ERRORS, METRICS
 from meshspiral.geometry import remesh as module
@@ -134,6 +141,22 @@ def test_a_pool_computes_the_same_meshes(toys, tmp_path):
         here, there = toys.load(name).mesh, pooled.load(name).mesh
         np.testing.assert_array_equal(there.vertices, here.vertices)
         np.testing.assert_array_equal(there.faces, here.faces)
+
+
+@pytest.mark.parametrize("shared", [None, 1])
+def test_later_epochs_have_other_tessellations_of_the_same_shape(tmp_path, shared):
+    shapes = Remeshed(Toys(), Cache(tmp_path), 1, "isotropic", 120, copies=2, shared=shared)
+    assert shapes.fresh
+    names = [name_in(e, n) for e in (0, 1, 2) for n in ("train/0.ply", "train/0.ply~2")]
+    meshes = [shapes.load(name).mesh for name in names]
+    if shared:  # there is one tessellation
+        assert all((mesh.faces == meshes[0].faces).all() for mesh in meshes)
+    else:
+        assert len({mesh.vertices.tobytes() for mesh in meshes}) == 6
+    own = Toys().load("train/0.ply").mesh
+    for mesh in meshes:
+        _, _, off = closest_points(own, mesh.vertices, np.full(mesh.vertices.shape, np.nan))
+        assert off.max() < 0.05
 
 
 def test_training_shapes_can_have_several_tessellations(tmp_path):

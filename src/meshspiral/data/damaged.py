@@ -8,7 +8,7 @@ import numpy as np
 
 from meshspiral.data.cache import code_version
 from meshspiral.data.settings import DamageSettings
-from meshspiral.data.shapes import Shape, ShapeSet, SurfacePoints
+from meshspiral.data.shapes import Shape, ShapeSet, SurfacePoints, epoch_of
 from meshspiral.geometry import holes
 from meshspiral.geometry.digest import derived_seed
 from meshspiral.geometry.mesh import Mesh, in_use
@@ -32,6 +32,8 @@ class Damaged(ShapeSet):
         settings: What damage.
     """
 
+    fresh = True
+
     def __init__(self, base: ShapeSet, settings: DamageSettings) -> None:
         self.base, self._settings = base, settings
         self.template, self.up, self.names = base.template, base.up, base.names
@@ -41,8 +43,9 @@ class Damaged(ShapeSet):
         self.base.prepare(names)
 
     def load(self, name: str) -> Shape:
-        shape = self.base.load(name)
-        if name not in self._damaged:
+        original, _ = epoch_of(name)
+        shape = self.base.load(name if self.base.fresh else original)
+        if original not in self._damaged:
             return shape
         rng = np.random.default_rng(derived_seed(self._settings.seed, "damage", name))
         return damaged(shape, self._settings, rng)

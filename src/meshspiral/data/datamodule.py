@@ -10,6 +10,7 @@ from itertools import islice
 import lightning as L
 import numpy as np
 import torch
+from joblib import cpu_count
 from torch.utils.data import DataLoader
 
 from meshspiral.data.cache import Cache
@@ -42,7 +43,13 @@ class CorrespondenceData(L.LightningDataModule):
         workers: Number of processes that compute what is not cached; None for one per core.
         half: Keep descriptors as float16 in the cache.
         readers: Number of processes that read meshes ahead of the steps; None for one if the
-            meshes do not fit into `KEPT` bytes of memory, else none.
+            meshes do not fit into `KEPT` bytes of memory, else none. With `fresh`, one per core but
+            one, and at least one.
+        fresh: Train each epoch on other versions of the shapes. They are made while the epoch
+            before is trained, and cached.
+
+    Raises:
+        DataError: `fresh`, of shapes that have no other versions.
     """
 
     def __init__(
@@ -56,8 +63,15 @@ class CorrespondenceData(L.LightningDataModule):
         workers: int | None = None,
         half: bool = False,
         readers: int | None = None,
+        fresh: bool = False,
     ):
         super().__init__()
+        if fresh and not shapes.fresh:
+            raise DataError(
+                "data.fresh needs shapes that can be made anew: data=anny, data/remesh= or "
+                "data/damage="
+            )
+        self.fresh = fresh
         self.shapes, self.features = shapes, features
         self.neighbourhood, self.cache = neighbourhood, cache
         self.seed, self.workers, self.readers = seed, workers, readers
@@ -119,7 +133,8 @@ class CorrespondenceData(L.LightningDataModule):
     def train_dataloader(self) -> DataLoader:
         skip, self._skip = self._skip, 0
         rank, world = self._rank_and_world()
-        sampler = EpochSampler(len(self.datasets["train"]), self.seed, skip, rank, world)
+        size = len(self.datasets["train"])
+        sampler = EpochSampler(size, self.seed, skip, rank, world, self.fresh)
         return self._loader("train", sampler)
 
     def val_dataloader(self) -> DataLoader:
@@ -141,7 +156,9 @@ class CorrespondenceData(L.LightningDataModule):
     def _loader(self, split: str, sampler: Iterable[int]) -> DataLoader:
         dataset = self.datasets[split]
         readers = self.readers
-        if readers is None:
+        if readers is None and self.fresh and split == "train":
+            readers = max(1, cpu_count() - 1)
+        elif readers is None:
             readers = int(item_bytes(dataset[0]) * dataset.sizes.sum() / dataset.sizes[0] > KEPT)
         ahead = {
             "multiprocessing_context": "spawn",  # forks could hang in libraries that have threads

@@ -12,6 +12,7 @@ from torch.utils.data import Dataset, Sampler
 
 from meshspiral.data.cache import Arrays
 from meshspiral.data.prepared import Prepared, Recipe
+from meshspiral.data.shapes import name_in
 from meshspiral.neighbourhoods.base import Batch
 
 KEPT = 2**29  # bytes of a split that stay in memory
@@ -20,7 +21,9 @@ KEPT = 2**29  # bytes of a split that stay in memory
 class MeshDataset(Dataset):
     """The tensors of one split. Item i is a dictionary, without a batch dimension.
 
-    Items are read when they are asked for. The first ones stay in memory, up to `KEPT` bytes.
+    Items are read when they are asked for. The first ones stay in memory, up to `KEPT` bytes. Item
+    i + e M, for M shapes and e > 0, is shape i in the version of epoch e, see `name_in`. What the
+    cache lacks for it is computed when it is asked for.
 
     Entries:
         features: float32 [V, C], the descriptors.
@@ -55,9 +58,17 @@ class MeshDataset(Dataset):
     def __len__(self) -> int:
         return len(self._prepared)
 
+    def __iter__(self) -> Iterator[Batch]:
+        return (self[i] for i in range(len(self)))
+
     def __getitem__(self, i: int) -> Batch:
-        if i not in range(len(self)):
-            raise IndexError(f"{i} must be an item, 0..{len(self) - 1}")
+        epoch, i = divmod(i, len(self))
+        if epoch < 0 or (epoch and not self._recipe.shapes.fresh):
+            given = i + epoch * len(self)
+            raise IndexError(f"{given} must be an item, 0..{len(self) - 1}")
+        if epoch:
+            prepared = self._recipe.prepare(name_in(epoch, self.names[i]))
+            return {**self._recipe.read(prepared, self._tables), "index": i}
         item = self._items.get(i)
         if item is None:
             item = self._recipe.read(self._prepared[i], self._tables)
@@ -86,9 +97,19 @@ class EpochSampler(Sampler[int]):
             those that a run had done before it was stopped.
         rank: Number of this process.
         world: Number of processes; this one serves every world-th item.
+        fresh: Whether later epochs have versions of their own of the items, see `MeshDataset`.
     """
 
-    def __init__(self, size: int, seed: int, skip: int = 0, rank: int = 0, world: int = 1):
+    def __init__(
+        self,
+        size: int,
+        seed: int,
+        skip: int = 0,
+        rank: int = 0,
+        world: int = 1,
+        fresh: bool = False,
+    ):
+        self.fresh = fresh
         self.size, self.seed, self.skip, self.epoch = size, seed, skip, 0
         self.rank, self.world = rank, world
 
@@ -103,7 +124,8 @@ class EpochSampler(Sampler[int]):
         order = np.random.default_rng([self.seed, self.epoch]).permutation(self.size)
         order = np.resize(order, len(self) * self.world)[self.rank :: self.world].tolist()
         skip, self.skip = self.skip, 0
-        yield from order[skip:]
+        version = self.epoch * self.size if self.fresh else 0
+        yield from (version + i for i in order[skip:])
 
 
 def ignore_signals(reader: int) -> None:

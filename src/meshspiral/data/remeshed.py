@@ -9,7 +9,7 @@ import numpy as np
 
 from meshspiral.data.cache import Arrays, Cache, code_version
 from meshspiral.data.preprocessing import Task, load_task, run_tasks
-from meshspiral.data.shapes import DataError, Shape, ShapeSet, SurfacePoints
+from meshspiral.data.shapes import DataError, Shape, ShapeSet, SurfacePoints, epoch_of, name_in
 from meshspiral.geometry import mesh as meshes
 from meshspiral.geometry import remesh
 from meshspiral.geometry.barycentric import interpolate
@@ -23,7 +23,7 @@ class Remeshed(ShapeSet):
     Template, names and split are those of the other data set. The ground truth of a vertex is the
     point of the template that corresponds to its closest point on the original shape; its label is
     the nearest corner of that point's face. The seed of a tessellation derives from the content of
-    the shape.
+    the shape. In a later epoch, a shape to train on has another tessellation.
 
     Args:
         base: The other data set.
@@ -40,6 +40,8 @@ class Remeshed(ShapeSet):
     Raises:
         DataError: PyMeshLab is not installed, or `shared` is more than the training shapes.
     """
+
+    fresh = True
 
     def __init__(
         self,
@@ -70,7 +72,7 @@ class Remeshed(ShapeSet):
                 f"shapes, got {shared}"
             )
         self._shared = originals[:: len(originals) // shared][:shared] if shared else []
-        self._train = set(self.names["train"])
+        self._train, self._number = set(self.names["train"]), copies
 
     def prepare(self, names: list[str]) -> None:
         self._base.prepare(sorted({self._original(name)[0] for name in names}))
@@ -130,11 +132,15 @@ class Remeshed(ShapeSet):
 
     def _original(self, name: str) -> tuple[str, int]:
         """Name of the shape in the other data set, and the number of this copy, counted from 1."""
-        return self._copies.get(name, (name, 1))
+        name, epoch = epoch_of(name)
+        original, copy = self._copies.get(name, (name, 1))
+        if self._base.fresh:
+            return name_in(epoch, original), copy
+        return original, copy + epoch * self._number
 
     def _pattern(self, name: str) -> str | None:
         """The name of the shape whose tessellation a shape shares; None if it has its own."""
-        if not (self._shared and name in self._train):
+        if not (self._shared and epoch_of(name)[0] in self._train):
             return None
         return self._shared[derived_seed("tessellation", name) % len(self._shared)]
 

@@ -98,6 +98,9 @@ class DataSettings(Strict):
     shot: ShotSettings
     shuffle_vertices: bool = Field(description="renumber the vertices of every mesh at random")
     cache_dir: Text = Field(description="folder of cached results")
+    fresh: bool = Field(
+        description="train each epoch on other people (anny), tessellations (remesh) and damage"
+    )
     half: bool = Field(description="keep descriptors as float16 in the cache: half the space")
     readers: int | None = Field(
         ge=0,

@@ -104,6 +104,8 @@ class ShapeSet(ABC):
         template: The reference mesh: labels are its vertices, and errors are measured on it.
         names: For each of "train", "val" and "test" the names of its shapes, in a fixed order.
         up: The axis that points up in pictures, "y" or "z".
+        fresh: Whether `load` knows other versions of the shapes to train on, one for each epoch, by
+            names as `name_in` gives them.
     """
 
     registered: ClassVar[dict[str, type[ShapeSet]]] = {}
@@ -111,6 +113,7 @@ class ShapeSet(ABC):
     template: Mesh
     names: dict[str, list[str]]
     up = "y"
+    fresh = False
 
     def __init_subclass__(cls, name: str | None = None, **options: Any) -> None:
         super().__init_subclass__(**options)
@@ -133,12 +136,23 @@ class ShapeSet(ABC):
         """Load a shape.
 
         Args:
-            name: One of `names`.
+            name: One of `names`; if `fresh`, also what `name_in` makes of one of "train".
 
         Raises:
             DataError: There is no such shape, or its data are unusable.
             MeshError: Its mesh is unusable.
         """
+
+
+def name_in(epoch: int, name: str) -> str:
+    """The name of the version of a shape that an epoch is trained on: "name@2" in the third."""
+    return f"{name}@{epoch}" if epoch else name
+
+
+def epoch_of(name: str) -> tuple[str, int]:
+    """The name of the shape and the epoch of which `name_in` made a name."""
+    name, _, epoch = name.partition("@")
+    return name, int(epoch or 0)
 
 
 def file_stamp(*paths: Path | None) -> str:

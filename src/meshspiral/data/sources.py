@@ -54,4 +54,5 @@ def open_data(config: Any) -> CorrespondenceData:
         data.workers,
         data.half,
         data.readers,
+        data.fresh,
     )

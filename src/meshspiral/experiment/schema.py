@@ -419,6 +419,7 @@ def upgraded(values: dict[str, Any]) -> dict[str, Any]:
             values["neighbourhood"].setdefault(key, value)
     data.setdefault("shuffle_vertices", False)
     data.setdefault("half", False)
+    data.setdefault("fresh", False)
     data.setdefault("readers", None)
     if isinstance(values.get("optim"), dict):
         values["optim"].setdefault("soft_labels", None)

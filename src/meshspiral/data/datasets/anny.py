@@ -16,7 +16,14 @@ from meshspiral.data import posing
 from meshspiral.data.cache import code_version
 from meshspiral.data.datasets.bodies import Bodies, Size
 from meshspiral.data.settings import DataSettings
-from meshspiral.data.shapes import DataError, Shape, ShapeSet, SurfacePoints, registered_shape
+from meshspiral.data.shapes import (
+    DataError,
+    Shape,
+    ShapeSet,
+    SurfacePoints,
+    epoch_of,
+    registered_shape,
+)
 from meshspiral.geometry.mesh import Mesh
 from meshspiral.geometry.remesh import closest_points
 
@@ -31,7 +38,7 @@ class Anny(ShapeSet, name="anny"):
 
     Every body follows from the seed and its name alone: "train_0003_07" is pose 7 of person 3 of
     the people to train on. Validation and test show 10 other people each, whose bodies do not
-    depend on `subjects`.
+    depend on `subjects`. In a later epoch, a name to train on stands for another person.
 
     Args:
         vertices: Size of the template: 1500, or 6890 as in FAUST.
@@ -46,7 +53,7 @@ class Anny(ShapeSet, name="anny"):
         DataError: Anny or PyMeshLab is not installed.
     """
 
-    up = "z"
+    up, fresh = "z", True
 
     class Settings(DataSettings):
         vertices: Size = Field(description="vertices of the template")
@@ -72,6 +79,7 @@ class Anny(ShapeSet, name="anny"):
         if missing := [name for name in NEEDED if importlib.util.find_spec(name) is None]:
             raise DataError(f"data=anny needs {', '.join(missing)}: pip install -e '.[anny]'")
         self._size, self._ages, self._seed = surface or vertices, ages, people_seed
+        self._subjects = subjects
         self.template = Bodies(vertices).template
         self._bodies = Bodies(self._size).template
         people = {"train": subjects, "val": TESTED, "test": TESTED}
@@ -86,11 +94,13 @@ class Anny(ShapeSet, name="anny"):
         }
 
     def load(self, name: str) -> Shape:
-        if name not in self._numbers:
+        body, epoch = epoch_of(name)
+        if body not in self._numbers:
             raise DataError(
                 f"no body is named {name!r}; the first is {next(iter(self._numbers))!r}"
             )
-        split, person, pose = self._numbers[name]
+        split, person, pose = self._numbers[body]
+        person += epoch * self._subjects
         traits = draw_person(np.random.default_rng([self._seed, split, person]), self._ages)
         rng = np.random.default_rng([self._seed, split, person, pose])
         tried = []
