@@ -53,6 +53,21 @@ def test_no_two_curves_look_alike_and_no_name_covers_one():
     assert names.x0 >= axes.get_window_extent().x1 and names.y0 >= 0
 
 
+def test_long_names_stand_below_the_axes_and_leave_them_wide():
+    name = (
+        "DiffusionNet, bodies mixed, shot.by_area yes, epochs 22, lr 0.002, val_every 2, and more"
+    )
+    curves = {f"{name} {i}": (THRESHOLDS, THRESHOLDS) for i in range(4)}
+    figure = curve_figure(curves)
+    FigureCanvasAgg(figure).draw()
+    [axes], [legend] = figure.axes, figure.legends
+    box, names, page = axes.get_window_extent(), legend.get_window_extent(), figure.bbox
+    assert names.y1 <= box.y0 and names.y0 >= 0
+    assert names.x0 >= 0 and names.x1 <= page.x1
+    assert box.width > 0.7 * page.width and box.height > 300
+    assert len(legend.get_texts()) == 4
+
+
 def test_curves_of_several_runs_have_a_band():
     curves = np.stack([THRESHOLDS, THRESHOLDS / 2])
     [axes] = curve_figure({"a": (THRESHOLDS, curves), "b": (THRESHOLDS, THRESHOLDS)}).axes

@@ -10,14 +10,15 @@ from typing import Any
 
 import numpy as np
 
+from meshspiral.data.descriptors import Descriptor
 from meshspiral.experiment.schema import TrainConfig
 from meshspiral.geometry.digest import digest
 from meshspiral.neighbourhoods import Neighbourhood
 from meshspiral.nn.networks import Network
 from meshspiral.reporting.runs import Run
 
-# data settings that do not tell data sets apart: what is computed of a shape
-NOT_OF_DATA = ("features", "shot.", "raw.", "shuffle_vertices")
+# data settings that do not tell data sets apart
+COMPUTED = ("features", "shuffle_vertices", "half")
 
 
 @dataclass(frozen=True, eq=False)
@@ -115,7 +116,7 @@ def data_labels(runs: list[Run]) -> list[str]:
         differing = [k for k, v in data.items() if any(other.get(k) != v for other in same_kind)]
         values = [
             value if isinstance(value, str | int) else digest(json.dumps(value))[:6]
-            for value in (data[key] for key in differing if not key.startswith(NOT_OF_DATA))
+            for value in (data[key] for key in differing if not is_computed(key))
         ]
         labels.append(" ".join([*filter(None, kind), *map(str, values)]))
     hashes: dict[str, list[str]] = {}  # of the test shapes, by label
@@ -132,6 +133,11 @@ def data_labels(runs: list[Run]) -> list[str]:
     return labels
 
 
+def is_computed(key: str) -> bool:
+    """Whether a setting of a data set says what is computed of its shapes, not which they are."""
+    return key in COMPUTED or key.partition(".")[0] in Descriptor.registered
+
+
 def varied_settings(runs: list[Run]) -> list[str]:
     """Keys of the settings that differ between two runs and that no attribute of a group shows.
 
@@ -142,7 +148,7 @@ def varied_settings(runs: list[Run]) -> list[str]:
     for name in {run.config.model.name for run in runs}:
         keys |= differing_keys([run for run in runs if run.config.model.name == name])
     shown = {"model.name", "model.metric"} | length_keys(runs)
-    shown |= {k for k in keys if k.startswith("data.") and not k[5:].startswith(NOT_OF_DATA)}
+    shown |= {k for k in keys if k.startswith("data.") and not is_computed(k[5:])}
     return sorted(keys - shown)
 
 

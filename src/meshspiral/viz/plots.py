@@ -24,6 +24,8 @@ from meshspiral.viz.colors import ERROR_COLORS, MOST_ERROR
 ERROR_LABEL = r"geodesic error / $\sqrt{\mathrm{area}}$"
 DPI = 160
 MOST_INSIDE = 8  # curves whose legend fits inside the axes
+LONGEST_INSIDE = 36  # characters of a label that fits there
+LINE = 72  # characters of a line below the axes
 
 
 def curve_figure(curves: Mapping[str, tuple[np.ndarray, np.ndarray]]) -> Figure:
@@ -33,8 +35,13 @@ def curve_figure(curves: Mapping[str, tuple[np.ndarray, np.ndarray]]) -> Figure:
         curves: By name, the thresholds over sqrt(area), float [T], and the shares in 0..1: float
             [T] of one run, or [R, T] of several, shown as mean and a band from minimum to maximum.
     """
-    many = len(curves) > MOST_INSIDE
+    longest = max(map(len, curves), default=0)
+    below, many = longest > LONGEST_INSIDE, len(curves) > MOST_INSIDE
     size = (7.4, max(3.6, 0.19 * len(curves) + 0.2)) if many else (4.8, 3.6)
+    if below:
+        curves = {textwrap.fill(name, LINE): curve for name, curve in curves.items()}
+        lines = sum(name.count("\n") + 1 for name in curves)
+        size = (6.0, 3.8 + 0.18 * lines)
     figure = Figure(figsize=size, layout="constrained")
     axes = figure.add_subplot()
     axes.set_prop_cycle(cycler(linestyle=("-", "--", ":", "-.")) * rcParams["axes.prop_cycle"])
@@ -54,7 +61,9 @@ def curve_figure(curves: Mapping[str, tuple[np.ndarray, np.ndarray]]) -> Figure:
         xlabel=ERROR_LABEL, ylabel="correct matches (%)", xlim=(0, thresholds[-1]), ylim=(0, 100)
     )
     axes.grid(alpha=0.3)
-    if many:
+    if below:
+        figure.legend(loc="outside lower center", fontsize="small")
+    elif many:
         figure.legend(loc="outside right upper", fontsize="small")
     else:
         axes.legend(loc="lower right", fontsize="small")
