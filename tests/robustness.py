@@ -23,6 +23,7 @@ from tqdm import tqdm
 
 from meshspiral import Matcher, Mesh, scan
 from meshspiral.data.cache import Cache
+from meshspiral.data.damaged import warped
 from meshspiral.data.datasets.bodies import Bodies
 from meshspiral.data.reference import ReferenceDistances
 from meshspiral.data.remeshed import Remeshed
@@ -69,6 +70,11 @@ def add_noise(body: Shape, rng: np.random.Generator) -> Shape:
     return with_mesh(body, vertices + rng.normal(scale=0.002, size=vertices.shape), body.mesh.faces)
 
 
+def warp(body: Shape, rng: np.random.Generator) -> Shape:
+    mesh = body.mesh
+    return with_mesh(body, warped(mesh.vertices, 0.02, mesh.size, rng), mesh.faces)
+
+
 def remove_faces(body: Shape, rng: np.random.Generator) -> Shape:
     faces = body.mesh.faces
     return with_mesh(body, body.mesh.vertices, faces[rng.random(len(faces)) >= 0.1])
@@ -95,6 +101,7 @@ CHANGES: dict[str, Callable[[Shape, np.random.Generator], Shape]] = {
     "times 1000, moved by 1 km": scale_and_move,
     "renumbered": renumber,
     "noise of 2 mm": add_noise,
+    "warped, amplitude 0.02": warp,
     "a tenth of the faces removed": remove_faces,
     "cut off at the waist": cut_at_the_waist,
     "an arm, the head, part of a leg": three_parts,
