@@ -238,8 +238,8 @@ def test_a_network_too_large_for_the_memory_is_omitted_with_a_warning(monkeypatc
         ("parts=[naps]", "must be one of steps, memory, preprocessing, scaling, got naps"),
         ("repeats=0", "repeats must be at least 1, got 0"),
         ("+depth=1", "unknown key depth"),
-        ("models=[x]", "models must be of conv, fcs, gcnn3, lstm, got x"),
-        ("models=[]", "models must be of conv, fcs, gcnn3, lstm, got none"),
+        ("models=[x]", "models must be of acnn, conv, diffusion, fcs, gcnn3, lstm, monet, got x"),
+        ("models=[]", "models must be of acnn, conv, diffusion, fcs, gcnn3, lstm, monet, got none"),
     ],
 )
 def test_a_mistake_is_one_clear_line(cli, argument, message):

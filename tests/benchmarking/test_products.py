@@ -10,7 +10,7 @@ from meshspiral.benchmarking.products import Product, ProductRecorder, replay
 from meshspiral.benchmarking.steps import training_loss, training_step
 from meshspiral.data.tensors import draw
 from meshspiral.neighbourhoods import Neighbourhood
-from meshspiral.nn.networks.base import LAST, LIFTED
+from meshspiral.nn.networks.three_layers import LAST, LIFTED
 from tests.helpers import composed
 
 V, N, CLASSES, CHANNELS = 90, 5, 33, [24, 25, 26]

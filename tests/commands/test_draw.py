@@ -31,7 +31,7 @@ def test_both_tessellations_are_drawn(cli, toy_overrides, tmp_path):
         (["neighbourhoods.sampled.rays=0"], "neighbourhoods.sampled.rays must be at least 1"),
         (
             ["neighbourhoods.sampled.name=grid"],
-            "sampled.name must be one of patch, sampled, spiral",
+            "sampled.name must be one of anisotropic, disk, operators, patch, sampled, spiral",
         ),
         (["neighbourhoods.sampled.ray=3"], "did you mean"),
     ],

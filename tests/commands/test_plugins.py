@@ -112,7 +112,11 @@ def test_an_unknown_network_without_a_plugin_gives_a_one_line_error(cli, foreign
     rename_model(foreign, "other", [])
     code, out, err = cli(f"{key}={foreign}", "shapes=0", program=program)
     [line] = (out + err).strip().splitlines()
-    assert code == 1 and "model.name must be one of conv, fcs, gcnn3, lstm, got other" in line
+    assert (
+        code == 1
+        and "model.name must be one of acnn, conv, diffusion, fcs, gcnn3, lstm, monet, got other"
+        in line
+    )
 
 
 @pytest.mark.parametrize("group", ["model", "neighbourhood", "data"])

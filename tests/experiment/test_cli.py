@@ -105,7 +105,10 @@ def test_the_root_setting_metric_overrides_model_metric():
         (["+metric=maybe"], "metric must be true or false, got maybe"),
         (["seq_len=0"], "seq_len must be at least 1, got 0"),
         (["seq_len=many"], "seq_len must be a whole number, got many"),
-        (["model=foo"], "Could not find 'model/foo'; there are: conv, fcs, gcnn3, lstm"),
+        (
+            ["model=foo"],
+            "Could not find 'model/foo'; there are: acnn, conv, diffusion, fcs, gcnn3, lstm, monet",
+        ),
         (["data=foo"], "there are: anny, bodies, bodies_6890, bodies_6890_remeshed, bodies_mixed,"),
         (["+metrics=true"], "unknown key metrics; did you mean metric?"),
         (["+rate=1"], "unknown key rate; known: seq_len"),
@@ -135,7 +138,7 @@ def test_the_root_setting_metric_overrides_model_metric():
         (["model.channels=[1,2,x]"], "model.channels must be a whole number, got x"),
         (
             ["neighbourhood=foo"],
-            "'neighbourhood/foo'; there are: patch, sampled, spiral",
+            "'neighbourhood/foo'; there are: anisotropic, disk, operators, patch, sampled, spiral",
         ),
         (["plugins=[no_such.module]"], "plugins: cannot import no_such.module (ModuleNotFound"),
         (["plugins=5"], "plugins must be a list of modules, got 5"),
@@ -213,7 +216,7 @@ def test_help_shows_groups_settings_and_three_examples(cli):
     assert code == 0
     lines = [" ".join(line.split()) for line in out.splitlines()]
     for line in (
-        "model conv, fcs, gcnn3, lstm",
+        "model acnn, conv, diffusion, fcs, gcnn3, lstm, monet",
         "neighbourhood patch, sampled, spiral",
         "trainer cpu, ddp, gpu",
         "data/remesh isotropic, mixed",

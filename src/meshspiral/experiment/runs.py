@@ -12,7 +12,6 @@ from typing import Any
 from filelock import FileLock, Timeout
 from omegaconf import DictConfig, OmegaConf
 
-from meshspiral.data.descriptors import Features
 from meshspiral.experiment.run_folder import CONFIG, LAST, RunError, read_run_config, write_config
 from meshspiral.experiment.schema import TrainConfig, flat, read_config
 
@@ -85,6 +84,8 @@ def differences(config: TrainConfig, stored: TrainConfig) -> list[str]:
 
     A setting of a descriptor that is to be fitted does not differ from one that was fitted.
     """
+    from meshspiral.data.descriptors import Features  # imports torch, which takes seconds
+
     one, two = (flat(c.model_dump()) for c in (config, stored))
     keys = [key for key in one.keys() | two.keys() if key != "resume" and not may_change(key)]
     fitted = {f"data.{d.name}.{d.fitted}" for d in Features.of(config.data).descriptors}
