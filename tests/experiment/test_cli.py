@@ -217,7 +217,7 @@ def test_help_shows_groups_settings_and_three_examples(cli):
     lines = [" ".join(line.split()) for line in out.splitlines()]
     for line in (
         "model acnn, conv, diffusion, fcs, gcnn3, lstm, monet",
-        "neighbourhood patch, sampled, spiral",
+        "neighbourhood anisotropic, disk, operators, patch, sampled, spiral",
         "trainer cpu, ddp, gpu",
         "data/remesh isotropic, mixed",
         "seq_len number of vertices N of a spiral",

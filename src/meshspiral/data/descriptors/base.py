@@ -7,15 +7,17 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
 from types import ModuleType
-from typing import Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
-import torch
 from pydantic import BaseModel, create_model
 
 from meshspiral.data.settings import DataSettings
 from meshspiral.geometry.mesh import Mesh
 from meshspiral.geometry.shot import Frame
+
+if TYPE_CHECKING:
+    import torch  # takes seconds; the command line knows descriptors without it
 
 
 class Descriptor(ABC):
@@ -131,6 +133,8 @@ class Features:
 
     def drawn(self, features: torch.Tensor, generator: torch.Generator) -> torch.Tensor:
         """The features, float [V, channels], as an iteration of training reads them."""
+        import torch
+
         columns = features.split([descriptor.channels for descriptor in self.descriptors], dim=1)
         parts = [
             descriptor.drawn(part, generator)

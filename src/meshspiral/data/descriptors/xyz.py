@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
-import torch
 from pydantic import Field
 
 from meshspiral.data.descriptors.base import Descriptor
 from meshspiral.data.settings import Strict
 from meshspiral.geometry.mesh import Mesh
+
+if TYPE_CHECKING:
+    import torch  # takes seconds; the command line knows descriptors without it
 
 
 class Xyz(Descriptor, name="xyz"):
@@ -36,6 +40,8 @@ class Xyz(Descriptor, name="xyz"):
 
 def random_rotation(generator: torch.Generator) -> torch.Tensor:
     """A rotation, uniform among all, float64 [3, 3] (of a random unit quaternion)."""
+    import torch
+
     device = generator.device
     q = torch.randn(4, generator=generator, device=device, dtype=torch.float64)
     w, *v = q / q.norm()
