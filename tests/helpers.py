@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import signal
 import subprocess
 import sys
 import time
@@ -15,6 +16,7 @@ from meshspiral.experiment.compose import CONF
 from meshspiral.experiment.compose import compose_train as composed
 from meshspiral.experiment.run_folder import CONFIG, LAST
 from meshspiral.experiment.runs import claim
+from meshspiral.training.callbacks import Speed
 from meshspiral.training.run import train
 
 __all__ = ["METRICS", "QUICK", "ROOT", "SMALL", "STARTED", "composed"]
@@ -69,6 +71,19 @@ def same_weights(a: Path, b: Path) -> bool:
     one, two = weights(a), weights(b)
     assert one.keys() == two.keys()
     return all(torch.equal(one[k], two[k]) for k in one)
+
+
+def stop_at(monkeypatch, step: int) -> Callable[[], None]:
+    """Interrupt training in this process after a step; returns what takes that back."""
+    original = Speed.on_train_batch_end
+
+    def stop(self, trainer, *args):
+        original(self, trainer, *args)
+        if trainer.global_step == step:
+            os.kill(os.getpid(), signal.SIGINT)
+
+    monkeypatch.setattr(Speed, "on_train_batch_end", stop)
+    return lambda: monkeypatch.setattr(Speed, "on_train_batch_end", original)
 
 
 def start(command: list[str], **options) -> subprocess.Popen:

@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import signal
-
 import numpy as np
 import pytest
 import torch
@@ -16,9 +13,8 @@ from meshspiral.data.tensors import draw, mesh_tensors
 from meshspiral.experiment.run_folder import Stopped
 from meshspiral.neighbourhoods import Neighbourhood
 from meshspiral.nn.networks import Network
-from meshspiral.training.callbacks import Speed
 from tests.conftest import toy_shapes
-from tests.helpers import ROOT, SMALL, composed, run, same_weights
+from tests.helpers import ROOT, SMALL, composed, run, same_weights, stop_at
 
 MODELS = sorted(path.stem for path in (ROOT / "conf" / "model").glob("*.yaml"))
 
@@ -41,17 +37,10 @@ def test_it_trains_stops_resumes_to_the_bit_and_matches(
     metrics = run(tmp_path / "whole", overrides)
     assert np.isfinite(list(metrics.values())).all()
 
-    original = Speed.on_train_batch_end
-
-    def stop(self, trainer, *args):
-        original(self, trainer, *args)
-        if trainer.global_step == 8:
-            os.kill(os.getpid(), signal.SIGINT)
-
-    monkeypatch.setattr(Speed, "on_train_batch_end", stop)
+    go_on = stop_at(monkeypatch, 8)
     with pytest.raises(Stopped):
         run(tmp_path / "cut", overrides)
-    monkeypatch.setattr(Speed, "on_train_batch_end", original)
+    go_on()
     run(tmp_path / "cut", overrides)
     assert same_weights(tmp_path / "whole", tmp_path / "cut")
 

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import logging
-import os
-import signal
 
 import numpy as np
 import pytest
@@ -26,12 +24,11 @@ from meshspiral.geometry.mesh import Mesh
 from meshspiral.matching.matcher import Matcher
 from meshspiral.reporting.groups import group_runs
 from meshspiral.reporting.runs import read_runs
-from meshspiral.training.callbacks import Speed
 from meshspiral.training.initial import InitialWeights, checkpoint_of
 from meshspiral.training.module import Correspondence
 from meshspiral.training.run import train
 from tests.conftest import toy_shapes
-from tests.helpers import QUICK, composed, run, same_weights, weights
+from tests.helpers import QUICK, composed, run, same_weights, stop_at, weights
 
 FEATURES = 160  # channels of the toy data set's descriptors
 
@@ -178,17 +175,10 @@ def test_a_stopped_fine_tuned_run_resumes_to_the_same_weights(
     overrides = [*toy_overrides, f"init={source}", "optim.epochs=2"]
     run(tmp_path / "whole", overrides)
     assert not same_weights(tmp_path / "whole", base)
-    original = Speed.on_train_batch_end
-
-    def stop(self, trainer, *args):
-        original(self, trainer, *args)
-        if trainer.global_step == 3:
-            os.kill(os.getpid(), signal.SIGINT)
-
-    monkeypatch.setattr(Speed, "on_train_batch_end", stop)
+    go_on = stop_at(monkeypatch, 3)
     with pytest.raises(Stopped):
         run(tmp_path / "stopped", overrides)
-    monkeypatch.setattr(Speed, "on_train_batch_end", original)
+    go_on()
     source.unlink()
     resume = [f"resume={tmp_path / 'stopped'}"]
     train(resumed_config(composed(resume), resume), tmp_path / "stopped")

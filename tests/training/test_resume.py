@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import json
 import logging
-import os
 import shutil
-import signal
 
 import pytest
 
@@ -15,7 +13,7 @@ from meshspiral.experiment.runs import resumed_config
 from meshspiral.training.callbacks import Speed
 from meshspiral.training.module import rate_factor
 from meshspiral.training.run import train
-from tests.helpers import composed, run, same_weights
+from tests.helpers import composed, run, same_weights, stop_at
 
 STEPS = 6  # per epoch of the toy data set
 
@@ -46,18 +44,6 @@ def rates(folder) -> dict[int, float]:
 
     events = EventAccumulator(str(folder)).Reload().Scalars("lr-Adam")
     return {event.step: event.value for event in events}
-
-
-def stop_at(monkeypatch, step: int):
-    original = Speed.on_train_batch_end
-
-    def stop(self, trainer, *args):
-        original(self, trainer, *args)
-        if trainer.global_step == step:
-            os.kill(os.getpid(), signal.SIGINT)
-
-    monkeypatch.setattr(Speed, "on_train_batch_end", stop)
-    return lambda: monkeypatch.setattr(Speed, "on_train_batch_end", original)
 
 
 def test_with_a_constant_rate_a_longer_run_equals_an_uninterrupted_one(toy_overrides, tmp_path):
