@@ -65,14 +65,11 @@ def dihedral_angles(mesh: Mesh) -> tuple[np.ndarray, np.ndarray]:
     shared, one, two = np.intersect1d(keys[left], keys[right], return_indices=True)
     left, right = owner[left[one]], owner[right[two]]
     ends = np.stack(np.divmod(shared, count), axis=1)
-    normals = mesh.face_normals
-    with np.errstate(invalid="ignore", divide="ignore"):
-        normals = normals / np.linalg.norm(normals, axis=1, keepdims=True)
-        along = mesh.vertices[ends[:, 1]] - mesh.vertices[ends[:, 0]]
-        along = along / np.linalg.norm(along, axis=1, keepdims=True)
-        a, b = normals[left], normals[right]
-        sine = np.einsum("ei,ei->e", np.cross(a, b), along)
-        angles = np.arctan2(sine, np.einsum("ei,ei->e", a, b))
+    normals = _unit(mesh.face_normals)
+    along = _unit(mesh.vertices[ends[:, 1]] - mesh.vertices[ends[:, 0]])
+    a, b = normals[left], normals[right]
+    sine = np.einsum("ei,ei->e", np.cross(a, b), along)
+    angles = np.arctan2(sine, np.einsum("ei,ei->e", a, b))
     return ends, np.nan_to_num(angles)
 
 
@@ -87,13 +84,9 @@ def principal_directions(mesh: Mesh, tensors: np.ndarray) -> np.ndarray:
         float64 [F, 2, 3], orthonormal, right-handed with the face's normal: smallest, largest.
         Signs are arbitrary, and so is everything where both are equal; zeros on faces of area 0.
     """
-    normals = mesh.face_normals
-    with np.errstate(invalid="ignore", divide="ignore"):
-        normals = normals / np.linalg.norm(normals, axis=1, keepdims=True)
+    normals = _unit(mesh.face_normals)
     flat = ~np.isfinite(normals).all(axis=1)
-    edge = mesh.vertices[mesh.faces[:, 1]] - mesh.vertices[mesh.faces[:, 0]]
-    with np.errstate(invalid="ignore", divide="ignore"):
-        edge = edge / np.linalg.norm(edge, axis=1, keepdims=True)
+    edge = _unit(mesh.vertices[mesh.faces[:, 1]] - mesh.vertices[mesh.faces[:, 0]])
     plane = np.nan_to_num(np.stack([edge, np.cross(normals, edge)], axis=1))
     means = tensors[mesh.faces].mean(axis=1)
     inside = np.einsum("fai,fij,fbj->fab", plane, means, plane)
@@ -101,3 +94,9 @@ def principal_directions(mesh: Mesh, tensors: np.ndarray) -> np.ndarray:
     small = np.einsum("fa,fai->fi", vectors[:, :, 1], plane)
     small[flat] = 0.0
     return np.stack([small, np.cross(np.nan_to_num(normals), small)], axis=1)
+
+
+def _unit(vectors: np.ndarray) -> np.ndarray:
+    """The vectors [K, 3] with length 1; NaN where their length is 0."""
+    with np.errstate(invalid="ignore", divide="ignore"):
+        return vectors / np.linalg.norm(vectors, axis=1, keepdims=True)

@@ -9,7 +9,7 @@ from numba import njit
 
 from meshspiral.geometry.connectivity import one_rings
 from meshspiral.geometry.mesh import Mesh
-from meshspiral.geometry.patches import face_sectors, left_corners
+from meshspiral.geometry.patches import check_radius, face_sectors, left_corners
 from meshspiral.geometry.windows import polar_coordinates
 
 
@@ -51,8 +51,7 @@ def geodesic_disks(
     Raises:
         ValueError: `radius` is not positive and finite, or `most` is below 1.
     """
-    if not (np.isfinite(radius) and radius > 0):
-        raise ValueError(f"radius must be positive and finite, got {radius}")
+    check_radius(radius)
     if most < 1:
         raise ValueError(f"most must be at least 1, got {most}")
     neighbours, first = one_rings(mesh)

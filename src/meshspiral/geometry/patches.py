@@ -92,14 +92,19 @@ def geodesic_patches(
     return table
 
 
+def check_radius(radius: float) -> None:
+    """Raise ValueError if a radius is not positive and finite."""
+    if not (np.isfinite(radius) and radius > 0):
+        raise ValueError(f"radius must be positive and finite, got {radius}")
+
+
 def check_grid(radius: float, rings: int, rays: int) -> None:
     """Check the size of a polar grid.
 
     Raises:
         ValueError: `radius` is not positive and finite, or `rings` or `rays` is below 1.
     """
-    if not (np.isfinite(radius) and radius > 0):
-        raise ValueError(f"radius must be positive and finite, got {radius}")
+    check_radius(radius)
     if rings < 1 or rays < 1:
         raise ValueError(f"rings and rays must be at least 1, got {rings} and {rays}")
 
