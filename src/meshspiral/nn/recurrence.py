@@ -1,8 +1,8 @@
 """The LSTM recurrence over spirals, as an autograd function with its own backward pass.
 
-Each step writes gates, cells and hidden states into buffers that the backward pass reads; the
-gradient of the gates then overwrites the gates. All four gates use one sigmoid: the cell gate is
-tanh(x) = 1 - 2 sigmoid(-2 x), with the factor -2 inside sigmoid folded into the weights.
+Each step writes gates and cells into buffers that the backward pass reads; the gradient of the gates then overwrites the gates. PyTorch's sigmoid is several times as fast as its
+tanh, so tanh(x) = 1 - 2 sigmoid(-2 x). All four gates thus take one sigmoid, with the factor -2 of
+the cell gate folded into the weights.
 """
 
 from __future__ import annotations
@@ -14,9 +14,8 @@ from torch import Tensor
 
 from meshspiral.nn.precision import add_product
 
-ROWS = 512  # sequences per chunk; their states fit in the processor's cache
+ROWS = 1024  # sequences per chunk; with fewer, two threads wait for each other more often
 _sigmoid_backward = torch.ops.aten.sigmoid_backward.grad_input
-_tanh_backward = torch.ops.aten.tanh_backward.grad_input
 
 
 def recurrence(
@@ -110,8 +109,8 @@ class _Buffers(NamedTuple):
         has_padding: For each step, whether any sequence has padding there; N entries.
         metric: Metric features, float [R, N, M], or None.
         gates: Activations of the gates, float [N, R, 4 H].
-        cells: Cell states, float [N, R, H].
-        hidden: Hidden states, float [N, R, H].
+        cells: Cell states c, float [N, R, H].
+        squashed: sigmoid(-2 c), float [N, R, H]; the hidden state is o (1 - 2 sigmoid(-2 c)).
     """
 
     indices: Tensor
@@ -120,7 +119,7 @@ class _Buffers(NamedTuple):
     metric: Tensor | None
     gates: Tensor
     cells: Tensor
-    hidden: Tensor
+    squashed: Tensor
 
 
 def _forward_steps(
@@ -146,28 +145,32 @@ def _forward_steps(
     (rows, length), width = spirals.shape, recurrent.shape[0]
     slots = length if save else 2
     gates = inputs.new_empty(slots, rows, 4 * width)
-    cells, hidden = inputs.new_empty(2, slots, rows, width)
+    cells, squashed = inputs.new_empty(2, slots, rows, width)
+    hidden = inputs.new_empty(2, rows, width)
     indices, padding = spirals.clamp(min=0).T.contiguous(), (spirals < 0).T[..., None]
     has_padding = padding.any(dim=1).flatten().tolist()
-    gate, cell, state = gates.unbind(), cells.unbind(), hidden.unbind()
+    gate, cell, squash = gates.unbind(), cells.unbind(), squashed.unbind()
     i, f, g, o = _split_gates(gates)
     for step in range(length):
         now, before = step % slots, (step - 1) % slots
+        state, last_state = hidden[step % 2], hidden[(step - 1) % 2]
         torch.index_select(inputs, 0, indices[step], out=gate[now])
         if metric is not None:
             gate[now].addmm_(metric[:, step], metric_map)
         if step > 0:
-            add_product(gate[now], state[before].to(recurrent.dtype), recurrent)
+            add_product(gate[now], last_state.to(recurrent.dtype), recurrent)
         gate[now].sigmoid_()
         torch.addcmul(i[now], i[now], g[now], value=-2, out=cell[now])  # i tanh = i (1 - 2 g)
         if step > 0:
             cell[now].addcmul_(f[now], cell[before])
-        torch.tanh(cell[now], out=state[now]).mul_(o[now])
+        torch.mul(cell[now], -2, out=squash[now]).sigmoid_()
+        torch.addcmul(o[now], o[now], squash[now], value=-2, out=state)  # o tanh(c)
         if has_padding[step]:
-            for buffer in (cell, state):  # padding leaves cell and hidden state unchanged
-                torch.where(padding[step], buffer[before], buffer[now], out=buffer[now])
-    out.copy_(state[now])
-    return _Buffers(indices, padding, has_padding, metric, gates, cells, hidden)
+            # padding leaves cell and hidden state unchanged
+            torch.where(padding[step], cell[before], cell[now], out=cell[now])
+            torch.where(padding[step], last_state, state, out=state)
+    out.copy_(state)
+    return _Buffers(indices, padding, has_padding, metric, gates, cells, squashed)
 
 
 def _backward_steps(
@@ -178,29 +181,33 @@ def _backward_steps(
     d_weight: Tensor,
     d_metric: Tensor | None,
 ) -> None:
-    """Add the gradients of R sequences, not yet scaled for the cell gate. Overwrites the gates.
+    """Add the gradients of R sequences, not yet scaled for the cell gate. Overwrites the buffers.
 
     Args:
-        buffers: Of the forward steps; its gates are overwritten by their gradient.
+        buffers: Of the forward steps; `gates` is overwritten by its gradient, and `squashed` by
+            the hidden states.
         grad: Gradient of the last hidden states, float [R, H].
         recurrent: Scaled recurrent weight, float [4 H, H].
         d_projected: Gradient to add to, float [V, 4 H].
         d_weight: Gradient to add to, float [4 H, H].
         d_metric: Gradient to add to, float [4 H, M].
     """
-    indices, padding, has_padding, metric, gates, cells, hidden = buffers
+    indices, padding, has_padding, metric, gates, cells, squashed = buffers
     dtype, width = recurrent.dtype, recurrent.shape[1]
     d_hidden, d_cell = grad.clone(), torch.zeros_like(grad)
-    scratch, tanh = torch.empty_like(grad), torch.empty_like(grad)
+    scratch = torch.empty_like(grad)
+    low = gates if dtype == gates.dtype else torch.empty_like(gates, dtype=dtype)
     d_gate = torch.empty_like(gates[0])
     d_i, d_f, d_g, d_o = d_gate.split(width, dim=1)
-    gate, cell = gates.unbind(), cells.unbind()
+    gate, cell, squash = gates.unbind(), cells.unbind(), squashed.unbind()
     i, f, g, o = _split_gates(gates)
     for step in reversed(range(len(gate))):
         passed = (d_hidden.clone(), d_cell.clone()) if has_padding[step] else None
-        torch.tanh(cell[step], out=tanh)
-        torch.mul(d_hidden, tanh, out=d_o), torch.mul(d_hidden, o[step], out=scratch)
-        d_cell += _tanh_backward(scratch, tanh, grad_input=scratch)
+        torch.addcmul(d_hidden, d_hidden, squash[step], value=-2, out=d_o)
+        torch.mul(d_hidden, o[step], out=scratch)
+        d_cell.add_(_sigmoid_backward(scratch, squash[step], grad_input=scratch), alpha=4)
+        # the hidden state, for the gradient of the weight; after padding any value will do
+        torch.addcmul(o[step], o[step], squash[step], value=-2, out=squash[step])
         torch.addcmul(d_cell, d_cell, g[step], value=-2, out=d_i)
         torch.mul(d_cell, i[step], out=d_g)
         if step > 0:
@@ -212,14 +219,14 @@ def _backward_steps(
         if passed:
             gate[step].masked_fill_(padding[step], 0.0)
         if step > 0:
-            d_hidden = (gate[step].to(dtype) @ recurrent).to(grad.dtype)
+            d_hidden = (low[step].copy_(gate[step]) @ recurrent).to(grad.dtype)
         if passed:  # at padding, the gradient passes through unchanged
             d_hidden += passed[0] * padding[step]
             torch.where(padding[step], passed[1], d_cell, out=d_cell)
     flat = gates.flatten(0, 1)
     d_projected.index_add_(0, indices.view(-1), flat)
-    later, states = gates[1:].flatten(0, 1), hidden[:-1].flatten(0, 1)
-    add_product(d_weight, later.to(dtype).T, states.to(dtype))
+    states = squashed[:-1].flatten(0, 1).to(dtype)
+    add_product(d_weight, low[1:].flatten(0, 1).T, states)
     if metric is not None:
         d_metric.addmm_(flat.T, metric.transpose(0, 1).flatten(0, 1))
 
