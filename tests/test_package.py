@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shutil
 import subprocess
 import sys
 import venv
@@ -51,6 +52,10 @@ def python(wheel, tmp_path_factory) -> Path:
     # behind it, without their .pth files: an editable install of the clone is not among them
     ours = next(path for path in sys.path if path.endswith("site-packages"))
     (packages / "dependencies.pth").write_text(f"{ours}\n")
+    for compiled in (ROOT / "src").rglob("*.nb?"):  # by numba, which takes long
+        copy = packages / compiled.relative_to(ROOT / "src")
+        copy.parent.mkdir(parents=True, exist_ok=True)
+        shutil.copy(compiled, copy)
     (folder / "bin" / "meshspiral").write_text(
         f"#!{folder}/bin/python\nfrom meshspiral.__main__ import main\nmain()\n"
     )
