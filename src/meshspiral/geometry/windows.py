@@ -90,13 +90,13 @@ def gaussian_windows(
     check_grid(radius, rings, rays)
     neighbours, first = one_rings(mesh)
     surface = mesh.vertices, neighbours, first, left_corners(mesh.faces, neighbours, first)
-    thirds = np.repeat(np.linalg.norm(mesh.face_normals, axis=1) / 6, 3)
-    areas = np.bincount(mesh.faces.ravel(), thirds, len(mesh.vertices))
     sectors = face_sectors(*surface)
     if turn is not None:
         sectors -= np.repeat(turn, np.diff(first))[:, None]
     return WindowTable(
-        *_all_windows(*surface, sectors, areas, float(radius), rings, rays, float(width))
+        *_all_windows(
+            *surface, sectors, mesh.vertex_areas, float(radius), rings, rays, float(width)
+        )
     )
 
 

@@ -1,7 +1,7 @@
 """The LSTM recurrence over spirals, as an autograd function with its own backward pass.
 
-Each step writes gates and cells into buffers that the backward pass reads; the gradient of the gates
-then overwrites the gates. PyTorch's sigmoid is several times as fast as its tanh, so
+Each step writes gates and cells into buffers that the backward pass reads; the gradient of the
+gates then overwrites the gates. PyTorch's sigmoid is several times as fast as its tanh, so
 tanh(x) = 1 - 2 sigmoid(-2 x). All four gates thus take one sigmoid, with the factor -2 of the cell
 gate folded into the weights.
 """
