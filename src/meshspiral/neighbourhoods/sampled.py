@@ -11,13 +11,12 @@ from scipy.sparse import csr_array
 
 from meshspiral.geometry import connectivity, geodesics, patches, sampling, shot
 from meshspiral.geometry.mesh import Mesh
-from meshspiral.geometry.shot import Frame
-from meshspiral.neighbourhoods.base import Arrays, Batch, Neighbourhood
+from meshspiral.neighbourhoods.base import Arrays, Batch
 from meshspiral.neighbourhoods.patch import by_rows_and_columns, first_directions
-from meshspiral.neighbourhoods.starts import StartSettings, draw_starts, start_title
+from meshspiral.neighbourhoods.starts import Started, StartSettings, draw_starts, start_title
 
 
-class Sampled(Neighbourhood, name="sampled"):
+class Sampled(Started, name="sampled"):
     """A spiral over the places of a polar grid around each vertex, ring by ring, clockwise.
 
     Its reach follows the surface, not the edges. Each place gives one vertex, or with `blend` the
@@ -73,14 +72,6 @@ class Sampled(Neighbourhood, name="sampled"):
     @property
     def least_vertices(self) -> int:
         return 1
-
-    @property
-    def random(self) -> bool:
-        return self.settings.start == "random"
-
-    @property
-    def frame(self) -> Frame | None:
-        return None if self.random else self.settings.frame
 
     @property
     def _radii(self) -> list[float]:

@@ -11,12 +11,11 @@ from pydantic import Field, field_validator
 from meshspiral.geometry import connectivity, spirals
 from meshspiral.geometry.mesh import Mesh
 from meshspiral.geometry.sampling import nearest_neighbours
-from meshspiral.geometry.shot import Frame
-from meshspiral.neighbourhoods.base import Arrays, Batch, Neighbourhood
-from meshspiral.neighbourhoods.starts import StartSettings, draw_starts, start_title
+from meshspiral.neighbourhoods.base import Arrays, Batch
+from meshspiral.neighbourhoods.starts import Started, StartSettings, draw_starts, start_title
 
 
-class Spiral(Neighbourhood, name="spiral"):
+class Spiral(Started, name="spiral"):
     """The spiral around each vertex: N vertices, or all vertices of k rings.
 
     Gives `spirals`, int64 [V, N]: one spiral of every vertex; -1 where it has ended. With a
@@ -62,14 +61,6 @@ class Spiral(Neighbourhood, name="spiral"):
     @property
     def least_vertices(self) -> int:
         return self._reach or 1
-
-    @property
-    def random(self) -> bool:
-        return self.settings.start == "random"
-
-    @property
-    def frame(self) -> Frame | None:
-        return None if self.random else self.settings.frame
 
     @property
     def _steps(self) -> list[int]:

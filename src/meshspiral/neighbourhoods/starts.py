@@ -41,6 +41,18 @@ class StartSettings(Neighbourhood.Settings):
         return self
 
 
+class Started(Neighbourhood):
+    """A neighbourhood whose sequences have a start. Its `Settings` derive from `StartSettings`."""
+
+    @property
+    def random(self) -> bool:
+        return self.settings.start == "random"
+
+    @property
+    def frame(self) -> Frame | None:
+        return None if self.random else self.settings.frame
+
+
 def start_title(settings: StartSettings) -> str:
     """The start for titles: empty for the paper's random one."""
     if settings.start == "random":

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 import torch
 from pydantic import Field
 from torch import Tensor, nn
 
 from meshspiral.nn.layers import METRIC_FEATURES, glorot
-from meshspiral.nn.networks.spiral_net import SpiralNet
+from meshspiral.nn.networks.spiral_net import OneLengthNet
 
 
 class SpiralConv(nn.Module):
@@ -86,7 +85,7 @@ class SpiralConv(nn.Module):
         return self.out((hidden * self.sum).sum(dim=1))
 
 
-class ConvNet(SpiralNet, name="conv"):
+class ConvNet(OneLengthNet, name="conv"):
     """Three convolutions along spirals of fixed length.
 
     Args:
@@ -104,7 +103,7 @@ class ConvNet(SpiralNet, name="conv"):
 
     title = "CONV-NET"
 
-    class Settings(SpiralNet.Settings):
+    class Settings(OneLengthNet.Settings):
         widening: int = Field(ge=1, description="hidden channels of a layer per output channel")
         taps: int = Field(ge=1, description="length of the convolution's kernel, odd")
 
@@ -127,15 +126,6 @@ class ConvNet(SpiralNet, name="conv"):
         super().__init__(
             in_features, num_classes, channels, metric, metric_layers, dropout, feature_scale
         )
-
-    @classmethod
-    def check(cls, neighbourhood: Any) -> None:
-        if neighbourhood.length is None:
-            raise ValueError(f"{cls.name} needs sequences of one length, got {neighbourhood.title}")
-
-    @classmethod
-    def options(cls, neighbourhood: Any) -> dict[str, Any]:
-        return {"seq_len": neighbourhood.length}
 
     def spiral_layer(self, in_features: int, out_features: int, metric: bool) -> nn.Module:
         hidden = self.widening * out_features

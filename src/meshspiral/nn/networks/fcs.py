@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 from torch import nn
 
 from meshspiral.nn.layers import SpiralLinear
-from meshspiral.nn.networks.spiral_net import SpiralNet
+from meshspiral.nn.networks.spiral_net import OneLengthNet
 
 
-class FCSNet(SpiralNet, name="fcs"):
+class FCSNet(OneLengthNet, name="fcs"):
     """FCS-NET: a fully connected layer over each spiral of fixed length.
 
     Args:
@@ -42,15 +41,6 @@ class FCSNet(SpiralNet, name="fcs"):
         super().__init__(
             in_features, num_classes, channels, metric, metric_layers, dropout, feature_scale
         )
-
-    @classmethod
-    def check(cls, neighbourhood: Any) -> None:
-        if neighbourhood.length is None:
-            raise ValueError(f"{cls.name} needs sequences of one length, got {neighbourhood.title}")
-
-    @classmethod
-    def options(cls, neighbourhood: Any) -> dict[str, Any]:
-        return {"seq_len": neighbourhood.length}
 
     def spiral_layer(self, in_features: int, out_features: int, metric: bool) -> nn.Module:
         return SpiralLinear(in_features, out_features, self.seq_len, metric)

@@ -122,6 +122,19 @@ class SpiralNet(ThreeLayerNet):
         return self.layers[i](x, spirals, metric)
 
 
+class OneLengthNet(SpiralNet):
+    """A network on spirals of one length, the argument `seq_len` of its constructor."""
+
+    @classmethod
+    def check(cls, neighbourhood: Any) -> None:
+        if neighbourhood.length is None:
+            raise ValueError(f"{cls.name} needs sequences of one length, got {neighbourhood.title}")
+
+    @classmethod
+    def options(cls, neighbourhood: Any) -> dict[str, Any]:
+        return {"seq_len": neighbourhood.length}
+
+
 def _of_layer(i: int, *values: Any) -> list[Any]:
     """What the i-th layer reads of values that may be tuples with an entry for each layer."""
     return [v[i] if type(v) is tuple else v for v in values]  # a Resampling is a tuple too
