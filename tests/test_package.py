@@ -52,7 +52,7 @@ def python(wheel, tmp_path_factory) -> Path:
     # behind it, without their .pth files: an editable install of the clone is not among them
     ours = next(path for path in sys.path if path.endswith("site-packages"))
     (packages / "dependencies.pth").write_text(f"{ours}\n")
-    for compiled in (ROOT / "src").rglob("*.nb?"):  # by numba, which takes long
+    for compiled in (ROOT / "src").rglob("*.nb?"):  # numba's code, which takes long to compile
         copy = packages / compiled.relative_to(ROOT / "src")
         copy.parent.mkdir(parents=True, exist_ok=True)
         shutil.copy(compiled, copy)

@@ -523,7 +523,7 @@ def test_a_network_learns_independently_of_the_numbering(toy_overrides, tmp_path
     original = run(tmp_path / "original", [*toy_overrides, *LEARN])
     shuffled = run(tmp_path / "shuffled", [*toy_overrides, *LEARN, "data.shuffle_vertices=true"])
     assert original["test/exact_match"] > 0.4  # chance: 0.006
-    assert shuffled["test/exact_match"] == pytest.approx(original["test/exact_match"], abs=0.12)
+    assert shuffled["test/exact_match"] == pytest.approx(original["test/exact_match"], abs=0.08)
     assert shuffled["test/geodesic_error"] == pytest.approx(
         original["test/geodesic_error"], abs=0.06
     )

@@ -146,7 +146,7 @@ def write_often(root, value):
 
 
 def test_two_processes_can_write_the_same_key(cache, caplog):
-    context = multiprocessing.get_context("fork")  # no imports
+    context = multiprocessing.get_context("fork")  # spawn would import torch twice
     writers = [context.Process(target=write_often, args=(cache.root, v)) for v in (1, 2)]
     for writer in writers:
         writer.start()
@@ -177,7 +177,7 @@ def prepare(root, started):
 
 
 def test_four_processes_share_a_cold_cache_and_one_is_killed(tmp_path, caplog):
-    context = multiprocessing.get_context("fork")  # no imports
+    context = multiprocessing.get_context("spawn")
     started = context.Semaphore(0)
     processes = [
         context.Process(target=prepare, args=(tmp_path / "all", started)) for _ in range(4)

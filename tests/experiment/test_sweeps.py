@@ -40,7 +40,7 @@ from meshspiral.training.callbacks import OrderlyStop
 from tests import helpers
 from tests.helpers import QUICK, ROOT, composed, program_process, run, wait_for, weights
 
-SWEEP = ["-m", "seed=0,1,2", "optim.epochs=6"]
+SWEEP = ["-m", "seed=0,1,2", "optim.epochs=12"]
 
 
 def test_a_killed_sweep_resumes_with_the_unfinished_jobs(cli, toy_overrides, tmp_path):
@@ -83,7 +83,7 @@ def test_a_killed_sweep_resumes_with_the_unfinished_jobs(cli, toy_overrides, tmp
     assert (sweep / "seed-0" / METRICS).stat().st_mtime_ns == first
 
     uninterrupted = tmp_path / "uninterrupted"
-    run(uninterrupted, [*toy, "optim.epochs=6", "seed=1"])
+    run(uninterrupted, [*toy, "optim.epochs=12", "seed=1"])
     resumed, expected = weights(sweep / "seed-1"), weights(uninterrupted)
     assert all((resumed[key] == expected[key]).all() for key in expected)
 
@@ -462,3 +462,8 @@ def test_the_experiments_of_the_paper_are_sweeps(cli, toy_overrides, monkeypatch
     assert {c.model.dropout for c in configs} == {0.3}
     remeshed = {(c.data.remesh.policy, c.data.remesh.vertices) for c in configs if c.data.remesh}
     assert remeshed == ({("isotropic", None), ("mixed", None)} if name == "remeshed" else set())
+
+
+@pytest.mark.parametrize("name", ["lengths", "remeshed", "rotations"])
+def test_other_experiments_take_the_settings_of_the_paper_too(name):
+    assert composed([f"experiment=[paper,{name}]"]).optim.lr == 0.001

@@ -13,10 +13,15 @@ from meshspiral.geometry import connectivity, geodesics, patches, sampling, shot
 from meshspiral.geometry.mesh import Mesh
 from meshspiral.neighbourhoods.base import Arrays, Batch
 from meshspiral.neighbourhoods.patch import by_rows_and_columns, first_directions
-from meshspiral.neighbourhoods.starts import Started, StartSettings, draw_starts, start_title
+from meshspiral.neighbourhoods.starts import (
+    StartedSequences,
+    StartSettings,
+    draw_starts,
+    start_title,
+)
 
 
-class Sampled(Started, name="sampled"):
+class Sampled(StartedSequences, name="sampled"):
     """A spiral over the places of a polar grid around each vertex, ring by ring, clockwise.
 
     Its reach follows the surface, not the edges. Each place gives one vertex, or with `blend` the

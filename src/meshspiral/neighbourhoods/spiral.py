@@ -12,10 +12,15 @@ from meshspiral.geometry import connectivity, spirals
 from meshspiral.geometry.mesh import Mesh
 from meshspiral.geometry.sampling import nearest_neighbours
 from meshspiral.neighbourhoods.base import Arrays, Batch
-from meshspiral.neighbourhoods.starts import Started, StartSettings, draw_starts, start_title
+from meshspiral.neighbourhoods.starts import (
+    StartedSequences,
+    StartSettings,
+    draw_starts,
+    start_title,
+)
 
 
-class Spiral(Started, name="spiral"):
+class Spiral(StartedSequences, name="spiral"):
     """The spiral around each vertex: N vertices, or all vertices of k rings.
 
     Gives `spirals`, int64 [V, N]: one spiral of every vertex; -1 where it has ended. With a

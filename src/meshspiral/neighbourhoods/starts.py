@@ -41,8 +41,10 @@ class StartSettings(Neighbourhood.Settings):
         return self
 
 
-class Started(Neighbourhood):
-    """A neighbourhood whose sequences have a start. Its `Settings` derive from `StartSettings`."""
+class StartedSequences(Neighbourhood):
+    """A neighbourhood whose sequences have a start."""
+
+    Settings = StartSettings
 
     @property
     def random(self) -> bool:

@@ -124,7 +124,7 @@ class GeodesicConv(nn.Module):
         with full_precision:
             samples = resample(features, resampling).view(-1, rays, width)
             spectrum = (basis @ samples).view(-1, half, 2 * width).transpose(0, 1)
-            # cast and copied once: a transposed factor slows the gradient by the weights threefold
+            # a cast also puts it in order, without which the gradient by the weights is slow
             spectrum = spectrum.to(dtype, memory_format=torch.contiguous_format)
             template = basis @ self.weight.view(outs, rays, width)
             template = template.view(outs, half, 2, width).permute(2, 1, 3, 0) * rays**0.5

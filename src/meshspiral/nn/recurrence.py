@@ -1,9 +1,9 @@
 """The LSTM recurrence over spirals, as an autograd function with its own backward pass.
 
-Each step writes gates and cells into buffers that the backward pass reads; the gradient of the
-gates then overwrites the gates. PyTorch's sigmoid is several times as fast as its tanh, so
-tanh(x) = 1 - 2 sigmoid(-2 x). All four gates thus take one sigmoid, with the factor -2 of the cell
-gate folded into the weights.
+Each step writes gates, cells and a sigmoid of the cells into buffers for the backward pass; the
+gradient of the gates then overwrites the gates. PyTorch's sigmoid is several times as fast as its
+tanh, so tanh(x) = 1 - 2 sigmoid(-2 x). All four gates thus take one sigmoid, with the factor -2 of
+the cell gate folded into the weights.
 """
 
 from __future__ import annotations
@@ -15,7 +15,9 @@ from torch import Tensor
 
 from meshspiral.nn.precision import add_product
 
-ROWS = 1024  # sequences per chunk; with fewer, two threads wait for each other more often
+# Sequences per chunk. With fewer, two threads wait for each other more often; with more, steps are
+# slower as well.
+ROWS = 1024
 _sigmoid_backward = torch.ops.aten.sigmoid_backward.grad_input
 
 
@@ -111,7 +113,8 @@ class _Buffers(NamedTuple):
         metric: Metric features, float [R, N, M], or None.
         gates: Activations of the gates, float [N, R, 4 H].
         cells: Cell states c, float [N, R, H].
-        squashed: sigmoid(-2 c), float [N, R, H]; the hidden state is o (1 - 2 sigmoid(-2 c)).
+        squashed: s = sigmoid(-2 c), float [N, R, H]. The hidden state is o (1 - 2 s), except at
+            padding.
     """
 
     indices: Tensor
@@ -182,7 +185,7 @@ def _backward_steps(
     d_weight: Tensor,
     d_metric: Tensor | None,
 ) -> None:
-    """Add the gradients of R sequences, not yet scaled for the cell gate. Overwrites the buffers.
+    """Add the gradients of R sequences, not yet scaled for the cell gate.
 
     Args:
         buffers: Of the forward steps; `gates` is overwritten by its gradient, and `squashed` by
@@ -197,7 +200,7 @@ def _backward_steps(
     dtype, width = recurrent.dtype, recurrent.shape[1]
     d_hidden, d_cell = grad.clone(), torch.zeros_like(grad)
     scratch = torch.empty_like(grad)
-    low = gates if dtype == gates.dtype else torch.empty_like(gates, dtype=dtype)
+    gates_low = gates if dtype == gates.dtype else torch.empty_like(gates, dtype=dtype)
     d_gate = torch.empty_like(gates[0])
     d_i, d_f, d_g, d_o = d_gate.split(width, dim=1)
     gate, cell, squash = gates.unbind(), cells.unbind(), squashed.unbind()
@@ -207,7 +210,7 @@ def _backward_steps(
         torch.addcmul(d_hidden, d_hidden, squash[step], value=-2, out=d_o)
         torch.mul(d_hidden, o[step], out=scratch)
         d_cell.add_(_sigmoid_backward(scratch, squash[step], grad_input=scratch), alpha=4)
-        # the hidden state, for the gradient of the weight; after padding any value will do
+        # now the hidden state, for d_weight; wrong at padding, where later gates have no gradient
         torch.addcmul(o[step], o[step], squash[step], value=-2, out=squash[step])
         torch.addcmul(d_cell, d_cell, g[step], value=-2, out=d_i)
         torch.mul(d_cell, i[step], out=d_g)
@@ -220,14 +223,14 @@ def _backward_steps(
         if passed:
             gate[step].masked_fill_(padding[step], 0.0)
         if step > 0:
-            d_hidden = (low[step].copy_(gate[step]) @ recurrent).to(grad.dtype)
+            d_hidden = (gates_low[step].copy_(gate[step]) @ recurrent).to(grad.dtype)
         if passed:  # at padding, the gradient passes through unchanged
             d_hidden += passed[0] * padding[step]
             torch.where(padding[step], passed[1], d_cell, out=d_cell)
     flat = gates.flatten(0, 1)
     d_projected.index_add_(0, indices.view(-1), flat)
     states = squashed[:-1].flatten(0, 1).to(dtype)
-    add_product(d_weight, low[1:].flatten(0, 1).T, states)
+    add_product(d_weight, gates_low[1:].flatten(0, 1).T, states)
     if metric is not None:
         d_metric.addmm_(flat.T, metric.transpose(0, 1).flatten(0, 1))
 

@@ -123,7 +123,7 @@ class SpiralNet(ThreeLayerNet):
 
 
 class OneLengthNet(SpiralNet):
-    """A network on spirals of one length, the argument `seq_len` of its constructor."""
+    """A network on spirals of one length. Its constructor takes that length as `seq_len`."""
 
     @classmethod
     def check(cls, neighbourhood: Any) -> None:
