@@ -438,9 +438,11 @@ def test_the_launchers_have_configs(cli, launcher):
         "parameters_others",
     ],
 )
-def test_the_experiments_of_the_paper_are_sweeps(cli, toy_overrides, monkeypatch, name, jobs):
-    """Checks their jobs, some with the paper's settings; `train` is replaced."""
-    paper = name in ("networks", "parameters")
+@pytest.mark.parametrize("paper", [False, True])
+def test_the_experiments_of_the_paper_are_sweeps(
+    cli, toy_overrides, monkeypatch, name, jobs, paper
+):
+    """Checks their jobs, with our settings and the paper's; `train` is replaced."""
     metrics = {"test/exact_match": 0.0, "test/geodesic_error": 0.0}
     monkeypatch.setattr(
         "meshspiral.training.run.train", lambda config, folder: write_metrics(folder, metrics)
@@ -462,8 +464,3 @@ def test_the_experiments_of_the_paper_are_sweeps(cli, toy_overrides, monkeypatch
     assert {c.model.dropout for c in configs} == {0.3}
     remeshed = {(c.data.remesh.policy, c.data.remesh.vertices) for c in configs if c.data.remesh}
     assert remeshed == ({("isotropic", None), ("mixed", None)} if name == "remeshed" else set())
-
-
-@pytest.mark.parametrize("name", ["lengths", "remeshed", "rotations"])
-def test_other_experiments_take_the_settings_of_the_paper_too(name):
-    assert composed([f"experiment=[paper,{name}]"]).optim.lr == 0.001

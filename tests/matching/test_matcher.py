@@ -252,7 +252,7 @@ def matchers(trained):
 
 @given(seed=st.integers(0, 2**32), repair=st.booleans(), which=st.integers(0, 2))
 @settings(
-    max_examples=60,
+    max_examples=100,
     deadline=10_000,
     derandomize=True,
     suppress_health_check=[HealthCheck.function_scoped_fixture],

@@ -2,8 +2,8 @@
 
 Each step writes gates, cells and a sigmoid of the cells into buffers for the backward pass; the
 gradient of the gates then overwrites the gates. PyTorch's sigmoid is several times as fast as its
-tanh, so tanh(x) = 1 - 2 sigmoid(-2 x). All four gates thus take one sigmoid, with the factor -2 of
-the cell gate folded into the weights.
+tanh, so tanh(x) is computed as 1 - 2 sigmoid(-2 x). All four gates then take one sigmoid, with the
+factor -2 of the cell gate folded into the weights.
 """
 
 from __future__ import annotations
