@@ -231,6 +231,15 @@ def test_a_network_too_large_for_the_memory_is_omitted_with_a_warning(monkeypatc
     assert re.fullmatch(r"  fcs +20000 +100000 +True +- +- +-", lines[2])
 
 
+def test_overrides_are_settings_of_the_networks_to_measure(cli, monkeypatch):
+    measured = []
+    monkeypatch.setattr(memory, "memory_rows", lambda _, networks: measured.extend(networks) or [])
+    words = ["models=[lstm]", "parts=[memory]", "hydra.run.dir=out"]
+    cli(*words, program=benchmark.main)
+    cli(*words, "overrides=[model.recompute=true]", program=benchmark.main)
+    assert [network.model.recompute for network in measured] == [False, True]
+
+
 @pytest.mark.parametrize(
     "argument, message",
     [
@@ -240,6 +249,7 @@ def test_a_network_too_large_for_the_memory_is_omitted_with_a_warning(monkeypatc
         ("+depth=1", "unknown key depth"),
         ("models=[x]", "models must be of acnn, conv, diffusion, fcs, gcnn3, lstm, monet, got x"),
         ("models=[]", "models must be of acnn, conv, diffusion, fcs, gcnn3, lstm, monet, got none"),
+        ("overrides=[model.depth=1]", "Could not override 'model.depth'"),
     ],
 )
 def test_a_mistake_is_one_clear_line(cli, argument, message):

@@ -194,6 +194,36 @@ def test_the_chunk_size_does_not_change_an_lstm(rows, monkeypatch):
         torch.testing.assert_close(layer(features, spirals, extra), whole[0], rtol=0, atol=1e-12)
 
 
+@pytest.mark.parametrize("metric", [False, True])
+def test_an_lstm_that_computes_its_steps_again_has_the_same_gradient(metric, monkeypatch):
+    torch.manual_seed(0)
+    layer = SpiralLSTM(5, 7, metric).double()
+    features, spirals = torch.randn(19, 5, dtype=torch.float64), sequences(19, 6, padded=True)
+    extra = torch.randn(19, 6, 2, dtype=torch.float64) if metric else None
+    chunks, original = [], recurrence._forward_steps
+
+    def noted(*arguments):
+        chunks.append((len(arguments[3]), arguments[-1]))
+        return original(*arguments)
+
+    monkeypatch.setattr(recurrence, "_forward_steps", noted)
+
+    def run():
+        layer.zero_grad()
+        out = layer(features, spirals, extra)
+        out.square().sum().backward()
+        return [out.detach(), *(p.grad.clone() for p in layer.parameters())]
+
+    kept = run()
+    assert chunks == [(19, True)]
+    chunks.clear()
+    layer.recompute = True
+    for a, b in zip(run(), kept, strict=True):
+        torch.testing.assert_close(a, b, rtol=0, atol=1e-12)
+    parts = [3, 3, 3, 3, 3, 3, 1]  # an eighth, rounded up; each without its steps, later with them
+    assert chunks == [*((n, False) for n in parts), *((n, True) for n in reversed(parts))]
+
+
 def test_backward_of_an_lstm_runs_only_once():
     layer = SpiralLSTM(3, 4)
     out = layer(torch.randn(9, 3), sequences(9, 5, padded=False)).sum()

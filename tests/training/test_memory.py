@@ -51,6 +51,7 @@ def a_network(overrides: list[str], vertices: int = VERTICES):
     [
         (["model=fcs"], 0.5, 1.5),  # a quarter of the peak is the system's own
         (["model=lstm"], 0.8, 1.3),
+        (["model=lstm", "model.recompute=true"], 0.6, 1.5),
         (["model=lstm", "neighbourhood.rings=2"], 0.8, 1.5),
         (["model=gcnn3"], 0.6, 1.6),
     ],

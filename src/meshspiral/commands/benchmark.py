@@ -50,7 +50,9 @@ def main(config: BenchmarkConfig) -> None:
 
 
 def network_configs(config: BenchmarkConfig) -> list[TrainConfig]:
-    """For each of the config's models what `train` composes for it, without metric information.
+    """For each of the config's models what `train` composes for it and the config's overrides.
+
+    Without metric information, unless an override asks for it.
 
     Raises:
         ConfigError: A name is not that of a registered network, or there is none.
@@ -72,7 +74,7 @@ def network_configs(config: BenchmarkConfig) -> list[TrainConfig]:
         f"plugins=[{','.join(config.plugins)}]",
     ]
     return [
-        read_config(TrainConfig, compose("train", [f"model={model}", *common]))
+        read_config(TrainConfig, compose("train", [f"model={model}", *common, *config.overrides]))
         for model in config.models
     ]
 

@@ -322,6 +322,7 @@ class BenchmarkConfig(Settings):
     ] = Field(description="precision of our step: 32, bf16, or auto")
     threads: Threads
     models: list[str] = Field(description="networks to measure")
+    overrides: list[str] = Field(description="settings of `train` for all of them")
     parts: list[Literal["steps", "memory", "preprocessing", "scaling"]] = Field(
         description="what to measure"
     )
@@ -395,6 +396,8 @@ def upgraded(values: dict[str, Any]) -> dict[str, Any]:
             values["neighbourhood"] = {"name": "spiral", **sequence}
     if "metric" in model:
         model.setdefault("metric_layers", "all")
+    if model.get("name") == "lstm":
+        model.setdefault("recompute", False)
     if data.get("remesh"):
         data["remesh"].setdefault("copies", 1)
         data["remesh"].setdefault("shared", None)

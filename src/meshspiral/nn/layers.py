@@ -149,10 +149,14 @@ class SpiralLSTM(nn.Module):
         in_features: Number of input channels per vertex.
         out_features: Size of the hidden state.
         metric: Whether the layer also takes metric features.
+        recompute: Whether to save memory by computing the steps again in the backward pass.
     """
 
-    def __init__(self, in_features: int, out_features: int, metric: bool = False):
+    def __init__(
+        self, in_features: int, out_features: int, metric: bool = False, recompute: bool = False
+    ):
         super().__init__()
+        self.recompute = recompute
         gates = 4 * out_features
         self.input = nn.Linear(in_features, gates)
         self.metric = nn.Linear(METRIC_FEATURES, gates, bias=False) if metric else None
@@ -178,11 +182,9 @@ class SpiralLSTM(nn.Module):
         """
         # Project vertices, not spiral elements: a vertex contributes the same to the gates in every
         # spiral, so V products suffice instead of V N.
-        if self.metric is None:
-            return recurrence(self.input(features), self.hidden.weight, spirals)
-        return recurrence(
-            self.input(features), self.hidden.weight, spirals, metric, self.metric.weight
-        )
+        information = (None, None) if self.metric is None else (metric, self.metric.weight)
+        projected = self.input(features)
+        return recurrence(projected, self.hidden.weight, spirals, *information, self.recompute)
 
 
 def glorot(weight: Tensor, fan_in: int, fan_out: int) -> None:

@@ -8,6 +8,7 @@ factor -2 of the cell gate folded into the weights.
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import torch
@@ -18,6 +19,7 @@ from meshspiral.nn.precision import add_product
 # Sequences per chunk. With fewer, two threads wait for each other more often; with more, steps are
 # slower as well.
 ROWS = 1024
+PARTS = 8  # chunks with `recompute`; so many for any mesh, so that memory is proportional to it
 _sigmoid_backward = torch.ops.aten.sigmoid_backward.grad_input
 
 
@@ -27,6 +29,7 @@ def recurrence(
     spirals: Tensor,
     metric: Tensor | None = None,
     metric_weight: Tensor | None = None,
+    recompute: bool = False,
 ) -> Tensor:
     """The hidden state of an LSTM at the last element of each sequence before padding.
 
@@ -40,6 +43,8 @@ def recurrence(
             no padding.
         metric: Metric features, float [R, N, M].
         metric_weight: Weight of the metric features, float [4 H, M]; required with `metric`.
+        recompute: Whether the backward pass runs the forward steps again, an eighth of the
+            sequences at a time, instead of keeping what all of them computed.
 
     Returns:
         float [R, H].
@@ -47,30 +52,33 @@ def recurrence(
     Raises:
         RuntimeError: In a second backward pass, since the first one frees the buffers.
     """
-    return _Recurrence.apply(projected, weight, metric_weight, spirals, metric)
+    return _Recurrence.apply(projected, weight, metric_weight, spirals, metric, recompute)
 
 
 class _Recurrence(torch.autograd.Function):
-    """The recurrence in chunks of ROWS sequences."""
+    """The recurrence in chunks of sequences."""
 
     @staticmethod
-    def forward(ctx, projected, weight, metric_weight, spirals, metric):
+    def forward(ctx, projected, weight, metric_weight, spirals, metric, recompute):
         scales = _gate_scales(weight.shape[1], -2.0, weight)
         inputs = projected.to(weight.dtype) * scales
         recurrent = (weight.T * scales).to(projected.dtype)
         metric_map = None if metric is None else metric_weight.T * scales
         out = weight.new_empty(len(spirals), weight.shape[1])
-        save = any(ctx.needs_input_grad)
+        needed = any(ctx.needs_input_grad)
 
-        ctx.chunks = []
-        for start in range(0, len(spirals), ROWS):
-            rows = slice(start, start + ROWS)
+        def run(rows: slice, last: Tensor, save: bool) -> _Buffers:
             extra = None if metric is None else metric[rows].to(weight.dtype)
-            buffers = _forward_steps(
-                inputs, recurrent, metric_map, spirals[rows], extra, out[rows], save
-            )
-            if save:
-                ctx.chunks.append((rows, buffers))
+            return _forward_steps(inputs, recurrent, metric_map, spirals[rows], extra, last, save)
+
+        size = math.ceil(len(spirals) / PARTS) if recompute else ROWS
+        ctx.chunks = []
+        for start in range(0, len(spirals), size):
+            rows = slice(start, start + size)
+            buffers = run(rows, out[rows], needed and not recompute)
+            if needed:
+                ctx.chunks.append((rows, None if recompute else buffers))
+        ctx.run = run if recompute else None
         ctx.save_for_backward(weight, metric_weight)
         ctx.vertices, ctx.product_dtype = len(projected), projected.dtype
         return out
@@ -95,12 +103,14 @@ class _Recurrence(torch.autograd.Function):
         chunks, ctx.chunks = ctx.chunks, None
         while chunks:  # pop, so that the buffers of each chunk are freed after its use
             rows, buffers = chunks.pop()
+            if buffers is None:
+                buffers = ctx.run(rows, torch.empty_like(grad[rows]), True)
             _backward_steps(buffers, grad[rows], recurrent, d_projected, d_weight, d_metric)
         d_projected *= scales
         d_weight *= scales[:, None]
         if d_metric is not None:
             d_metric *= scales[:, None]
-        return d_projected.to(ctx.product_dtype), d_weight, d_metric, None, None
+        return d_projected.to(ctx.product_dtype), d_weight, d_metric, None, None, None
 
 
 class _Buffers(NamedTuple):

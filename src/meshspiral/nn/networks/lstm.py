@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+from pydantic import Field
 from torch import nn
 
 from meshspiral.nn.layers import SpiralLSTM
@@ -21,9 +22,15 @@ class LSTMNet(SpiralNet, name="lstm"):
         metric_layers: "all" layers read it, or the "first" alone.
         dropout: Probability of dropout after FC16 and FC256.
         feature_scale: Constant factor of the descriptors.
+        recompute: Whether to compute the LSTM's steps again in the backward pass, for less memory.
     """
 
     title = "LSTM-NET"
+
+    class Settings(SpiralNet.Settings):
+        recompute: bool = Field(
+            description="compute the steps again in the backward pass: less memory, more time"
+        )
 
     def __init__(
         self,
@@ -34,10 +41,12 @@ class LSTMNet(SpiralNet, name="lstm"):
         metric_layers: str = "all",
         dropout: float = 0.3,
         feature_scale: float = 1.0,
+        recompute: bool = False,
     ):
+        self.recompute = recompute
         super().__init__(
             in_features, num_classes, channels, metric, metric_layers, dropout, feature_scale
         )
 
     def spiral_layer(self, in_features: int, out_features: int, metric: bool) -> nn.Module:
-        return SpiralLSTM(in_features, out_features, metric)
+        return SpiralLSTM(in_features, out_features, metric, self.recompute)
