@@ -11,7 +11,7 @@ import trimesh
 from meshspiral.data import preprocessing
 from meshspiral.data.cache import Cache
 from meshspiral.data.pool import run_in_pool
-from meshspiral.data.remeshed import Remeshed, usual_size
+from meshspiral.data.remeshed import Remeshed, torn, usual_size
 from meshspiral.data.shapes import (
     DataError,
     Shape,
@@ -29,6 +29,7 @@ from meshspiral.geometry.remesh import closest_points
 from tests import helpers
 from tests.conftest import toy_shapes
 from tests.helpers import run
+from tests.meshes import lattice
 
 
 class Toys(ShapeSet):
@@ -226,3 +227,48 @@ def test_networks_train_on_remeshed_shapes(toy_overrides, tmp_path, model):
     outcome = Outcome.load(tmp_path / ERRORS)
     assert (outcome.errors != outcome.label_errors).mean() > 0.9  # few true points are vertices
     assert json.loads((tmp_path / METRICS).read_text()) == metrics
+
+
+def test_faces_tear_where_a_shared_tessellation_joins_what_is_apart_in_another_shape():
+    """Two squares side by side, joined by faces; in the other shape one of them is far away."""
+    mesh = lattice(2, 6)
+    right = mesh.vertices[:, 0] > mesh.vertices[:, 0].max() / 2
+    apart = mesh.vertices + 10.0 * right[:, None] * [1, 0, 0]
+    across = right[mesh.faces].any(axis=1) & ~right[mesh.faces].all(axis=1)
+    assert 0 < across.sum() < len(across) / 2
+    np.testing.assert_array_equal(torn(mesh.vertices, 3 * apart, mesh.faces), across)
+    assert not torn(mesh.vertices, 3 * mesh.vertices, mesh.faces).any()
+
+
+class Hands(Toys):
+    """Shapes in which two boxes nearly touch, and shapes in which they are apart."""
+
+    def __init__(self):
+        super().__init__()
+        self.gaps = {"a": 0.03, "b": 0.3}
+        self.names = {"train": ["a", "b"], "val": [], "test": []}
+        self.template = self.mesh("a")
+
+    def mesh(self, name: str) -> Mesh:
+        x = 0.15 + self.gaps[name] / 2
+        boxes = [
+            trimesh.creation.box((0.3, 0.5, 0.3)).apply_translation([side * x, 0, 0])
+            for side in (-1, 1)
+        ]
+        both = trimesh.util.concatenate(boxes).subdivide_to_size(0.08)
+        return Mesh(both.vertices, both.faces, name)
+
+    def load(self, name: str) -> Shape:
+        return registered_shape(self.mesh(name), self.template)
+
+
+def test_what_is_fused_in_one_shape_is_torn_in_another(tmp_path, monkeypatch):
+    monkeypatch.setattr("meshspiral.geometry.remesh.FUSED", (0.02, 0.02))
+    shapes = Remeshed(Hands(), Cache(tmp_path), 1, "fused", 300, shared=1)
+    fused, apart = (shapes.load(name) for name in ("a", "b"))
+    pieces = [
+        trimesh.Trimesh(s.mesh.vertices, s.mesh.faces, process=False).body_count
+        for s in (fused, apart)
+    ]
+    assert pieces == [1, 2]
+    assert len(apart.mesh.vertices) == len(apart.labels) == len(apart.points.weights)

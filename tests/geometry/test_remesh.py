@@ -13,10 +13,17 @@ from scipy.spatial import cKDTree
 from meshspiral.data.settings import RemeshSettings
 from meshspiral.geometry.barycentric import interpolate
 from meshspiral.geometry.mesh import Mesh, MeshError
-from meshspiral.geometry.remesh import POLICIES, Tool, bending, closest_points, remesh
+from meshspiral.geometry.remesh import (
+    MIXTURES,
+    POLICIES,
+    Tool,
+    bending,
+    closest_points,
+    remesh,
+)
 from tests.meshes import bumpy_sphere, lattice
 
-SINGLE = [policy for policy in POLICIES if policy != "mixed"]
+SINGLE = list(POLICIES)
 
 
 @pytest.fixture(scope="module")
@@ -103,17 +110,36 @@ def test_tori_and_open_surfaces_get_the_size_wanted(policy):
     hills = lattice(15, 15)
     heights = np.sin(hills.vertices[:, 0]) / 2
     hills = Mesh(hills.vertices + heights[:, None] * [0, 0, 1], hills.faces)
+    if policy == "fused":
+        with pytest.raises(MeshError, match="policy fused needs a closed surface"):
+            remesh(hills, 100, policy)
+        return
     made = remesh(hills, 100, policy, seed=1).mesh
     assert 90 <= len(made.vertices) <= 100 and not solid(made).is_watertight
 
 
-def test_mixed_draws_every_other_policy(surface, monkeypatch):
+@pytest.mark.parametrize("gap, joined", [(0.03, True), (0.08, False)])
+def test_fused_fills_a_narrow_gap_and_leaves_a_wide_one(gap, joined, monkeypatch):
+    """Between two boxes of size about 1.2; of those that stay apart only one is left."""
+    monkeypatch.setattr("meshspiral.geometry.remesh.FUSED", (0.02, 0.02))
+    boxes = [
+        trimesh.creation.box((0.3, 0.5, 0.3)).apply_translation([side * (0.15 + gap / 2), 0, 0])
+        for side in (-1, 1)
+    ]
+    both = trimesh.util.concatenate(boxes).subdivide_to_size(0.08)
+    made = solid(remesh(Mesh(both.vertices, both.faces), 800, "fused", seed=0).mesh)
+    assert made.is_watertight and made.euler_number == 2
+    assert made.extents[0] == pytest.approx(0.6 + gap if joined else 0.3, abs=0.01)
+
+
+@pytest.mark.parametrize("mixture", MIXTURES)
+def test_a_mixture_draws_each_of_its_policies(mixture, surface, monkeypatch):
     drawn = []
     for kind in SINGLE:
         monkeypatch.setitem(POLICIES, kind, lambda tool, rng, kind=kind: drawn.append(kind))
     for seed in range(30):
-        remesh(surface, len(surface.vertices) - 2, "mixed", seed)
-    assert set(drawn) == set(SINGLE)
+        remesh(surface, len(surface.vertices) - 2, mixture, seed)
+    assert set(drawn) == set(SINGLE) - ({"fused"} if mixture == "mixed" else set())
 
 
 def test_where_two_sheets_touch_the_closest_point_is_on_the_own_sheet():
@@ -186,4 +212,7 @@ def test_without_pymeshlab_the_error_says_how_to_install_it(surface, monkeypatch
 
 
 def test_the_config_accepts_every_policy():
-    assert typing.get_args(RemeshSettings.model_fields["policy"].annotation) == tuple(POLICIES)
+    assert typing.get_args(RemeshSettings.model_fields["policy"].annotation) == (
+        *POLICIES,
+        *MIXTURES,
+    )

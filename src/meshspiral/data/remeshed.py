@@ -14,7 +14,10 @@ from meshspiral.geometry import mesh as meshes
 from meshspiral.geometry import remesh
 from meshspiral.geometry.barycentric import interpolate
 from meshspiral.geometry.digest import derived_seed, digest
-from meshspiral.geometry.mesh import Mesh
+from meshspiral.geometry.mesh import Mesh, in_use
+
+FUSING = ("fused", "scans")  # policies that may join parts which are apart in another shape
+TEAR = 4.0  # growth at which a face tears; that of skin is mostly below
 
 
 class Remeshed(ShapeSet):
@@ -84,15 +87,18 @@ class Remeshed(ShapeSet):
         pattern, task = self._tessellation(name)
         arrays = load_task(task, self._cache)
         corners, weights = source.mesh.faces[arrays["face"]], arrays["weights"]
-        vertices = arrays["vertices"]
+        vertices, faces = arrays["vertices"], arrays["faces"]
         if pattern is not None:
             if not np.array_equal(pattern.mesh.faces, source.mesh.faces):
                 raise DataError(
                     f"{name}: the faces are not those of {pattern.mesh.name}; data.remesh.shared "
                     "needs shapes with the same faces"
                 )
-            vertices = interpolate(source.mesh.vertices, corners, weights)
-        mesh = Mesh(vertices, arrays["faces"], source.mesh.name)
+            before, vertices = vertices, interpolate(source.mesh.vertices, corners, weights)
+            if self._policy in FUSING:
+                used, faces = in_use(faces[~torn(before, vertices, faces)])
+                vertices, corners, weights = vertices[used], corners[used], weights[used]
+        mesh = Mesh(vertices, faces, source.mesh.name)
         template = self.template.vertices
         if source.points is None:
             corners = source.labels[corners]
@@ -161,6 +167,23 @@ class Remeshed(ShapeSet):
             vertices = round(np.exp(draw(*np.log(vertices))))
         key = digest(*content, vertices, code, self._version)
         return Task("meshes", key, _remesh, (source, vertices, self._policy, seed))
+
+
+def torn(before: np.ndarray, after: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """Whether a face of a shared tessellation spans parts that touch in one shape but not another.
+
+    Args:
+        before: Vertices of the shape whose tessellation it is, float [V, 3].
+        after: Vertices of the shape that it is carried to, float [V, 3].
+        faces: int [F, 3].
+
+    Returns:
+        bool [F]: whether an edge grows more than TEAR times as much as the median edge.
+    """
+    one, other = faces, np.roll(faces, 1, axis=1)
+    lengths = [np.linalg.norm(x[one] - x[other], axis=2) for x in (before, after)]
+    growth = lengths[1] / np.maximum(lengths[0], 1e-12 * lengths[0].max())
+    return (growth > TEAR * np.median(growth)).any(axis=1)
 
 
 def usual_size(vertices: int) -> int:

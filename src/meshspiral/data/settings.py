@@ -40,8 +40,11 @@ class ShotSettings(Strict):
 class RemeshSettings(Strict):
     """Another tessellation of every shape."""
 
-    policy: Literal["isotropic", "adaptive", "refined", "simplified", "marching", "mixed"] = Field(
-        description="kind of tessellation; mixed draws one for every shape"
+    policy: Literal[
+        "isotropic", "adaptive", "refined", "simplified", "marching", "fused", "mixed", "scans"
+    ] = Field(
+        description="kind of tessellation; mixed draws one of the first five for every shape, "
+        "scans of all six"
     )
     vertices: int | list[int] | None = Field(
         description="vertices of a remeshed shape, or a range, from which each draws its number; "

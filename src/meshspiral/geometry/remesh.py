@@ -17,6 +17,8 @@ from scipy.spatial import cKDTree
 
 from meshspiral.geometry.mesh import Mesh, MeshError
 
+FUSED = (0.006, 0.012)  # half the width of gaps that "fused" closes, over the size of the mesh
+CELL = 0.012  # of its marching cubes, over the size of the mesh
 NEAREST = 16  # faces, by their centres, that are tried first for a closest point
 FACING = 0.2  # least cosine between the normal of a point and that of its closest face
 
@@ -47,29 +49,32 @@ def remesh(mesh: Mesh, vertices: int, policy: str = "isotropic", seed: int = 0) 
     - refined: edges that are shorter around four random vertices.
     - simplified: a fine mesh reduced by quadrics, with triangles stretched along flat directions.
     - marching: marching cubes, with slivers; thin parts are lost.
-    - mixed: one of these, drawn with the seed.
+    - fused: edges of equal length; gaps narrower than twice a distance drawn from `FUSED`, as
+      between fingers, are filled. For closed surfaces.
+    - mixed: one of the first five, drawn with the seed.
+    - scans: one of the six.
 
     Args:
         mesh: The source.
         vertices: Number of vertices wanted. "marching" and open surfaces may have a few per cent
             fewer.
-        policy: One of POLICIES.
+        policy: One of POLICIES or MIXTURES.
         seed: Determines all random choices.
 
     Returns:
         The remeshed surface and its closest points on the source.
 
     Raises:
-        MeshError: `vertices` is below 12, the policy is unknown, PyMeshLab cannot remesh the source
-            to that size, or PyMeshLab is not installed.
+        MeshError: `vertices` is below 12, the policy is unknown, the source of "fused" is not
+            closed, PyMeshLab cannot remesh the source to that size, or PyMeshLab is not installed.
     """
-    if policy not in POLICIES:
-        raise MeshError(f"policy must be one of {', '.join(POLICIES)}; got {policy!r}")
+    if policy not in (known := [*POLICIES, *MIXTURES]):
+        raise MeshError(f"policy must be one of {', '.join(known)}; got {policy!r}")
     if vertices < 12:
         raise MeshError(f"vertices must be at least 12, got {vertices}")
     rng = np.random.default_rng(seed)
-    if policy == "mixed":
-        policy = str(rng.choice([p for p in POLICIES if p != "mixed"]))
+    if policy in MIXTURES:
+        policy = str(rng.choice(MIXTURES[policy]))
     tool = Tool(mesh, vertices, rng)
     for _ in range(6):
         POLICIES[policy](tool, rng)
@@ -315,19 +320,19 @@ class Tool:
         self._set.apply_selection_inverse(invfaces=True, invverts=False)
         self.simplify(selected=True)
 
-    def marching_cubes(self, cell: float) -> None:
-        """Remesh the source by marching cubes, and discard all but the largest component.
+    def marching_cubes(self, cell: float, offset: float = 0.0) -> None:
+        """Remesh by marching cubes, and discard all but the largest component.
 
         Args:
             cell: Edge length of the cubes.
+            offset: How far outside the present surface the new one lies.
 
         Raises:
             MeshError: No surface is found at that size.
         """
-        self.reset()
         self._set.generate_resampled_uniform_mesh(
             cellsize=self._lab.PureValue(cell),
-            offset=self._lab.PureValue(0.0),
+            offset=self._lab.PureValue(offset),
             mergeclosevert=False,
             discretize=False,
             multisample=False,
@@ -390,11 +395,25 @@ def _marching(tool: Tool, rng: np.random.Generator) -> None:
     """Marching cubes, with cells fitted to the number of vertices wanted."""
     cell = 1.1 * tool.edge
     for _ in range(4):
+        tool.reset()
         tool.marching_cubes(cell * rng.uniform(0.99, 1.01))
         share = tool.count / tool.vertices
         if 1 <= share < 1.05:
             return
         cell *= np.sqrt(share) * 0.99
+
+
+def _fused(tool: Tool, rng: np.random.Generator) -> None:
+    """A morphological closing: the surface at a distance outside, and back to that inside it."""
+    tool.reset()
+    if tool.border():
+        raise MeshError(f"{tool.source.name}: policy fused needs a closed surface")
+    size = np.sqrt(tool.area)
+    distance = size * rng.uniform(*FUSED)
+    for offset in (distance, -distance):
+        tool.marching_cubes(CELL * size, offset)
+    tool.isotropic(rng.uniform(0.5, 0.6) * tool.edge, 3)  # removes the cubes
+    tool.isotropic(tool.edge, 8)
 
 
 POLICIES = {  # how a Tool gets about the number of vertices wanted
@@ -403,5 +422,6 @@ POLICIES = {  # how a Tool gets about the number of vertices wanted
     "refined": _refined,
     "simplified": _simplified,
     "marching": _marching,
-    "mixed": None,  # one of the others, see `remesh`
+    "fused": _fused,
 }
+MIXTURES = {"mixed": list(POLICIES)[:5], "scans": list(POLICIES)}
