@@ -42,6 +42,7 @@ TESSELLATIONS = [  # policy, number of vertices
 ]
 OPTIONS = {
     "default": {},
+    "unflip=false": {"unflip": False},
     "refine=crf": {"refine": "crf"},
     "refine=zoomout": {"refine": "zoomout"},
     "resample=true": {"resampled": True},

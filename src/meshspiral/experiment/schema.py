@@ -189,6 +189,9 @@ class MatchConfig(Settings):
         description="refine the labels: zoomout, for complete surfaces; crf, for any; null: not"
     )
     smooth: bool = Field(description="the same as refine=zoomout")
+    unflip: bool = Field(
+        description="put parts back that took left for right, if the template has both sides alike"
+    )
     scale: float | None = Field(
         gt=0,
         description="metres in a unit of the meshes, 0.001 for millimetres; null: radii follow "

@@ -20,7 +20,7 @@ from meshspiral.matching.confidence import Distributions
 from meshspiral.matching.matcher import MESH_STAGES, Labels, Matcher, nearest_vertices
 from meshspiral.training.checkpoints import BUNDLED_RUN
 
-CONTENT = "map_confidence"  # part of the key: earlier versions wrote less, so it is done anew
+CONTENT = "flipped"  # part of the key: earlier versions wrote less, so it is done anew
 STAGES = ("reading", *MESH_STAGES)  # of a mesh file
 FileReport = Callable[[str, str], None]  # is told "source" or "target", and a stage that begins
 
@@ -85,6 +85,7 @@ class MatchJob:
             resampled=self.config.resample,
             smooth=self.config.smooth,
             refine=self.config.refine,
+            unflip=self.config.unflip,
             scale=self.config.scale,
             height=self.config.height,
         )

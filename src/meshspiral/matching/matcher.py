@@ -35,6 +35,7 @@ from meshspiral.matching.confidence import (
     near_vertices,
     soft_points,
 )
+from meshspiral.matching.flips import mirror_images, without_flips
 from meshspiral.matching.mean_field import MeanField, likeliest_near
 from meshspiral.training.checkpoints import BUNDLED_RUN, config_of, read_checkpoint, template_of
 from meshspiral.training.predictor import Predictor
@@ -59,6 +60,8 @@ class Labels(NamedTuple):
             no face.
         near_confidence: float32 [V], the predicted probability that the true vertex of the template
             is at most 0.05 sqrt(area) from `template`; 0 at a vertex on no face.
+        flipped: bool [V], whether the network took left for right, and the label was moved to the
+            other side; False at a vertex on no face.
 
     On meshes unlike those of training, all probabilities are too high; docs/reliability.md says
     what was measured.
@@ -68,6 +71,7 @@ class Labels(NamedTuple):
     points: np.ndarray
     confidence: np.ndarray
     near_confidence: np.ndarray | None = None
+    flipped: np.ndarray | None = None
 
 
 class Match(NamedTuple):
@@ -102,6 +106,8 @@ class Matcher:
             `meshspiral.matching.mean_field`. "zoomout", for complete surfaces: refine them further
             by ZoomOut (Melzi et al. 2019), then take for each vertex the nearby label that the
             network finds likeliest. None: do not refine.
+        unflip: Whether parts that took left for right are put back, see
+            `meshspiral.matching.flips`; only with a template that is its own mirror image.
         scale: Length of one unit of the meshes in the template's unit; the bundled template is in
             metres. Radii are then those of a body of the template's size. None: they follow from
             the surface area; if a mesh has large holes, the size is sought, see `surest_size`.
@@ -125,6 +131,7 @@ class Matcher:
         resampled: bool | None = None,
         smooth: bool = False,
         refine: str | None = None,
+        unflip: bool = True,
         scale: float | None = None,
         height: float | None = None,
     ):
@@ -142,6 +149,7 @@ class Matcher:
         if height is not None:
             self._scale = np.ptp(self.template.vertices[:, "xyz".index(self.up)]) / height
         self._refine = "zoomout" if smooth else refine
+        self._mirror = mirror_images(self.template, self.up) if unflip else None
         self._features = Features.of(config.data)
         self._predictor = Predictor(saved, config, accelerator, calibrated=True)
 
@@ -152,8 +160,8 @@ class Matcher:
         Args:
             run: The run folder; only checkpoints/best.ckpt is read. None: the bundled network,
                 trained on human bodies.
-            **options: `accelerator`, `resampled`, `smooth`, `refine`, `scale` and `height` of the
-                class.
+            **options: `accelerator`, `resampled`, `smooth`, `refine`, `unflip`, `scale` and
+                `height` of the class.
 
         Raises:
             RunError: The checkpoint is missing or damaged, has no template, or needs a plugin.
@@ -193,23 +201,25 @@ class Matcher:
         if self._needs_resampling(len(mesh.vertices)):
             report("resampling")
             coarse = resample(mesh, self._training_size)
-            template, confidence, embedding = self._predict(coarse.mesh, report)
+            template, confidence, flipped, embedding = self._predict(coarse.mesh, report)
             points = self._points(template, embedding)
             nearest = coarse.corners[np.arange(len(mesh.vertices)), coarse.weights.argmax(axis=1)]
             points = self._interpolate(points[coarse.corners], coarse.weights, points[nearest])
-            template, confidence = self._nearest_vertices(points), confidence[nearest]
+            template = self._nearest_vertices(points)
+            confidence, flipped = confidence[nearest], flipped[nearest]
         else:
-            template, confidence, embedding = self._predict(mesh, report)
+            template, confidence, flipped, embedding = self._predict(mesh, report)
             points, nearest = self._points(template, embedding), np.arange(len(template))
         missing = scan.vertex_of < 0
-        template, confidence, points, row_of = (
-            values[scan.vertex_of] for values in (template, confidence, points, nearest)
+        template, confidence, points, flipped, row_of = (
+            values[scan.vertex_of] for values in (template, confidence, points, flipped, nearest)
         )
         template[missing], confidence[missing], points[missing] = -1, 0.0, np.nan
-        row_of[missing] = -1
+        flipped[missing], row_of[missing] = False, -1
         distributions = Distributions(embedding, *self._predictor.head, row_of)
         around = near_confidence(distributions, template, self._near_vertices)
-        return Labels(template.astype(np.int32), points, confidence, around), distributions
+        labels = Labels(template.astype(np.int32), points, confidence, around, flipped)
+        return labels, distributions
 
     def match(self, source: Scan, target: Scan) -> Match:
         """Map the vertices of a source to those of a target.
@@ -279,7 +289,9 @@ class Matcher:
         factor = self._predictor.neighbourhood.density_range
         return not self._training_size / factor <= vertices <= self._training_size * factor
 
-    def _predict(self, mesh: Mesh, report: Report) -> tuple[np.ndarray, np.ndarray, torch.Tensor]:
+    def _predict(
+        self, mesh: Mesh, report: Report
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, torch.Tensor]:
         """Predict for each vertex of a mesh a template vertex and its probability.
 
         Args:
@@ -287,28 +299,33 @@ class Matcher:
             report: As for `predict`.
 
         Returns:
-            Vertices of the template, int64 [W], their probabilities, float32 [W], and the input of
-            the network's last layer, [W, C].
+            Vertices of the template, int64 [W], their probabilities, float32 [W], `flipped` of
+            `Labels`, bool [W], and the input of the network's last layer, [W, C].
         """
         embedding = self._embed(mesh, report)
         prediction = self._predictor.predict(embedding)
         template, confidence = prediction.classes.cpu().numpy(), prediction.probability
+        flipped = np.zeros(len(template), dtype=bool)
         if self._refine is not None:
             report("refinement")
-            template = self._refined(mesh, embedding)
-            confidence = self._predictor.predict(embedding, torch.from_numpy(template)).of_label
-        return template, confidence.float().cpu().numpy(), embedding
-
-    def _refined(self, mesh: Mesh, embedding: torch.Tensor) -> np.ndarray:
-        """Refined labels, int64 [W], by what `refine` of the class says."""
-        weight, bias = self._predictor.head
-        scores = torch.addmm(bias, embedding.to(weight.dtype), weight.T)
-        log_probability = torch.log_softmax(scores, 1).cpu().numpy()
-        template = self._mean_field(log_probability, mesh)
+            template = self._mean_field(self._log_probability(embedding), mesh)
+        if self._mirror is not None:
+            mirrored = without_flips(template, mesh, self.template, self._mirror)
+            flipped = mirrored != template
+            scores = self._log_probability(embedding[torch.from_numpy(flipped)])
+            template[flipped] = likeliest_near(scores, mirrored[flipped], self.template)
         if self._refine == "zoomout":
             template = zoomout(*eigenfunctions(mesh, TO), self._eigenfunctions, template)
-            template = likeliest_near(log_probability, template, self.template)
-        return template
+            template = likeliest_near(self._log_probability(embedding), template, self.template)
+        if self._refine is not None or flipped.any():
+            confidence = self._predictor.predict(embedding, torch.from_numpy(template)).of_label
+        return template, confidence.float().cpu().numpy(), flipped, embedding
+
+    def _log_probability(self, embedding: torch.Tensor) -> np.ndarray:
+        """Of each template vertex, float32 [W, K], from the input of the last layer, [W, C]."""
+        weight, bias = self._predictor.head
+        scores = torch.addmm(bias, embedding.to(weight.dtype), weight.T)
+        return torch.log_softmax(scores, 1).cpu().numpy()
 
     def _embed(self, mesh: Mesh, report: Report) -> torch.Tensor:
         """The input of the network's last layer, [W, C], for each vertex of a mesh."""

@@ -153,6 +153,9 @@ def remark_lines(match: FileMatch) -> list[str]:
                 f"confidence {np.median(confidence):.2f}, below 0.5 at "
                 f"{100 * (confidence < 0.5).mean():.1f} %"
             )
+            if count := labels.flipped.sum():
+                share = 100 * count / len(confidence)
+                lines.append(f"  left and right put back at {count:,} vertices ({share:.1f} %)")
             lines += [f"  {remark}" for remark in scan.remarks]
     return lines
 

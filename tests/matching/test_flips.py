@@ -1,0 +1,97 @@
+"""Left and right put back: parts of a body whose labels are mirror images of the true ones."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from meshspiral.data.datasets.bodies import Bodies
+from meshspiral.data.scans import scan
+from meshspiral.matching.flips import mirror_images, without_flips
+from meshspiral.matching.job import FileMatch, LabelledScan
+from meshspiral.matching.matcher import Matcher
+from meshspiral.matching.writing import remark_lines
+
+BODIES = Bodies(1500)
+TEMPLATE = BODIES.template
+TRUE = np.arange(1500)
+X = TEMPLATE.vertices[:, 0]
+LEFT_ARM, RIGHT_ARM = 0.16 * np.ptp(X) < X, -0.16 * np.ptp(X) > X
+
+
+@pytest.fixture(scope="module")
+def mirror() -> np.ndarray:
+    return mirror_images(TEMPLATE, "z")
+
+
+def test_mirror_images_change_sides_and_nothing_else(mirror):
+    assert (LEFT_ARM[mirror] == RIGHT_ARM).mean() > 0.99
+    assert (mirror[mirror] == TRUE).mean() > 0.8
+    image = TEMPLATE.vertices[mirror] * [-1, 1, 1]
+    apart = np.linalg.norm(image - TEMPLATE.vertices, axis=1)
+    assert np.median(apart) < 0.5 * TEMPLATE.mean_edge
+
+
+def test_a_template_without_a_mirror_image_has_none():
+    assert mirror_images(BODIES.load("s8_walk").mesh, "z") is None
+
+
+@pytest.mark.parametrize("parts", [[LEFT_ARM], [LEFT_ARM, RIGHT_ARM]], ids=["one arm", "both arms"])
+@pytest.mark.parametrize("pose", ["s9_squat", "s8_arms_up"])
+def test_arms_are_put_back_and_the_rest_stays(parts, pose, mirror):
+    mesh = BODIES.load(pose).mesh
+    labels = TRUE.copy()
+    for part in parts:
+        labels[part] = mirror[TRUE[part]]
+    found = without_flips(labels, mesh, TEMPLATE, mirror)
+    wrong = np.linalg.norm(TEMPLATE.vertices[found] - TEMPLATE.vertices, axis=1)
+    assert wrong.max() < 0.05 * TEMPLATE.size
+    rest = ~np.any(parts, axis=0)
+    np.testing.assert_array_equal(found[rest], TRUE[rest])
+
+
+def test_noise_and_a_body_that_is_all_mirrored_stay(mirror):
+    """Labels that jump to anywhere would still jump as mirror images."""
+    mesh, rng = BODIES.load("s9_squat").mesh, np.random.default_rng(0)
+    noisy = np.where(rng.random(1500) < 0.02, rng.integers(1500, size=1500), TRUE)
+    changed = without_flips(noisy, mesh, TEMPLATE, mirror) != noisy
+    assert changed.sum() <= 3
+    assert not changed[noisy == TRUE].any()
+    np.testing.assert_array_equal(without_flips(mirror, mesh, TEMPLATE, mirror), mirror)
+
+
+def confused(matcher: Matcher, mirror: np.ndarray, monkeypatch) -> None:
+    """Let the network of a matcher take the left arm for the right one."""
+    original = matcher._predictor.predict
+
+    def predict(embedding, labels=None):
+        found = original(embedding, labels)
+        arm = LEFT_ARM[found.classes.numpy()]
+        found.classes.numpy()[arm] = mirror[found.classes.numpy()[arm]]
+        return found
+
+    monkeypatch.setattr(matcher._predictor, "predict", predict)
+
+
+def test_a_matcher_puts_parts_back_and_says_so(mirror, monkeypatch):
+    mesh = BODIES.load("s9_squat").mesh
+    opened = scan(mesh.vertices, mesh.faces, "a")
+    plain = Matcher.load().label(opened)
+    assert plain.flipped.mean() < 0.01
+
+    matcher = Matcher.load()
+    confused(matcher, mirror, monkeypatch)
+    labels, distributions = matcher.predict(opened)
+    assert (labels.flipped == LEFT_ARM).mean() > 0.98
+    assert (
+        labels.template == plain.template
+    ).mean() > 0.98  # by what the network says of that side
+    match = FileMatch("a.ply", LabelledScan(opened, labels, distributions), None, None, None)
+    [line] = [line for line in remark_lines(match) if "put back" in line]
+    assert line.startswith(f"  left and right put back at {labels.flipped.sum()} vertices (")
+
+    matcher = Matcher.load(unflip=False)
+    confused(matcher, mirror, monkeypatch)
+    kept = matcher.label(opened)
+    assert not kept.flipped.any()
+    assert LEFT_ARM[kept.template].sum() < 5
