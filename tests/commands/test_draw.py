@@ -15,11 +15,14 @@ from tests.neighbourhoods.made import patch, sampled, spiral
 def test_both_tessellations_are_drawn(cli, toy_overrides, tmp_path):
     data = [o for o in toy_overrides if o.startswith("data") and "shot" not in o]
     remesh = ["data/remesh=mixed", "data.remesh.vertices=120"]
-    output = f"output={tmp_path / 'around'}"
+    output = f"output={tmp_path / 'new folder' / 'around.v2'}"
     code, out, err = cli(*data, *remesh, output, "vertex=3", "seq_len=9", program=main)
     assert code == 0, err
-    assert sorted(p.name for p in tmp_path.glob("around.*")) == ["around.pdf", "around.png"]
-    assert "around.png" in out
+    assert sorted(p.name for p in tmp_path.glob("new folder/*")) == [
+        "around.v2.pdf",
+        "around.v2.png",
+    ]
+    assert "around.v2.png" in out
 
 
 @pytest.mark.parametrize(

@@ -279,6 +279,12 @@ def test_requested_data_settings_replace_those_of_the_run(toy_overrides, request
         assert getattr(config, group) == getattr(trained, group)
 
 
+def test_a_run_on_fresh_shapes_is_tested_on_a_data_set_without_any(toy_overrides):
+    trained = composed([*toy_overrides, "data.fresh=true"])
+    for requested in ({}, {"name": "bodies", "vertices": 1500}):
+        assert not config_on_data(trained, requested).data.fresh
+
+
 @pytest.mark.parametrize(
     "requested, message",
     [
@@ -312,31 +318,32 @@ class LabelledWithPoints(ShapeSet):
         return Shape(self.template, np.arange(size), size, SurfacePoints(corners, weights))
 
 
-@pytest.fixture
-def point_data(tmp_path):
+def point_data(tmp_path, shuffled=False):
     features = Features((Shot(ShotSettings(radius=0.3, bins=4, by_area=False)),), 0.3)
-    cache = Cache(tmp_path)
-    return CorrespondenceData(LabelledWithPoints(), features, spiral(8), cache, workers=1)
+    cache, options = Cache(tmp_path), {"workers": 1, "shuffle_vertices": shuffled}
+    return CorrespondenceData(LabelledWithPoints(), features, spiral(8), cache, **options)
 
 
 @pytest.mark.parametrize("shuffled", [False, True])
-def test_errors_are_measured_to_the_point_and_to_the_labelled_vertex(point_data, shuffled):
-    point_data.shuffle_vertices = shuffled
-    point_data.prepare(["test"])
-    item = point_data.datasets["test"][0]
-    labels, positions = item["labels"].numpy(), point_data.reference.place
-    result = result_of(labels, item, point_data.reference)
+def test_errors_are_measured_to_the_point_and_to_the_labelled_vertex(tmp_path, shuffled):
+    data = point_data(tmp_path, shuffled)
+    data.prepare(["test"])
+    item = data.datasets["test"][0]
+    assert (item["labels"] != torch.arange(162)).any() == shuffled
+    labels, positions = item["labels"].numpy(), data.reference.place
+    result = result_of(labels, item, data.reference)
     assert (result.label_errors == 0).all()
     point = np.einsum("vk,vkx->vx", item["weights"], positions[item["corners"]])
     np.testing.assert_allclose(result.errors, np.linalg.norm(point - positions[labels], axis=1))
-    outcome = Outcome.of(["c"], [item], {0: result}, point_data.reference.diameter)
+    outcome = Outcome.of(["c"], [item], {0: result}, data.reference.diameter)
     metrics, curve = outcome.metrics()
     assert metrics["geodesic_error"] > 0 == metrics["geodesic_error_to_label"]
     assert metrics["exact_match"] == 1 and curve[0] == 0
 
 
-def test_the_distance_to_a_point_is_interpolated_from_those_to_its_corners(point_data):
-    reference, template = point_data.reference, point_data.shapes.template
+def test_the_distance_to_a_point_is_interpolated_from_those_to_its_corners(tmp_path):
+    data = point_data(tmp_path)
+    reference, template = data.reference, data.shapes.template
     corners = template.faces[:50]
     predicted = np.full(50, 160)
     at_predicted = (corners == 160).any(axis=1)

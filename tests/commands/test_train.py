@@ -430,6 +430,8 @@ def test_resume_uses_the_config_of_the_run_and_allows_only_harmless_changes(
     group = ["data=folder", *resume]
     named = [*(o for o in toy_overrides if o.startswith("data.")), "data.workers=3"]
     assert resumed_config(composed([*group, *named]), [*group, *named]).data.workers == 3
+    read = [*resume, "data.readers=2"]
+    assert resumed_config(composed(read), read).data.readers == 2
     for other in ("seq_len=9", "model=lstm", "seed=4", "optim.lr=0.1", "+metric=true"):
         overrides = [*resume, other]
         with pytest.raises(RunError, match="contradicts the run in"):

@@ -235,6 +235,23 @@ def test_the_code_version_depends_on_the_source(tmp_path, monkeypatch):
     assert versions[0] != versions[1]
 
 
+def test_the_code_version_depends_on_the_geometry_that_a_module_imports(monkeypatch):
+    import inspect
+
+    from meshspiral.geometry import connectivity, laplacian, shot
+    from meshspiral.neighbourhoods import sampled
+
+    version, source = code_version.__wrapped__, inspect.getsource
+    before = version(sampled)
+    for changed, differs in ((shot, False), (connectivity, True), (laplacian, False)):
+
+        def edited(module, changed=changed):
+            return source(module) + "# edited" * (module is changed)
+
+        monkeypatch.setattr(inspect, "getsource", edited)
+        assert (version(sampled) != before) == differs, changed
+
+
 def test_results_that_another_process_saved_meanwhile_are_not_computed_again(tmp_path):
     cache, done = Cache(tmp_path), []
 

@@ -9,6 +9,7 @@ import pytest
 import torch
 
 from meshspiral.data.descriptors import Descriptor, Features
+from meshspiral.data.descriptors.geovec import Geovec
 from meshspiral.data.descriptors.hks import Hks
 from meshspiral.data.descriptors.raw import Raw
 from meshspiral.data.descriptors.shot import Shot
@@ -161,3 +162,11 @@ def test_settings_with_descriptors_are_pickled(toy_overrides):
     """For processes of their own."""
     config = composed(toy_overrides)
     assert pickle.loads(pickle.dumps(config)) == config
+
+
+def test_geovec_does_not_depend_on_the_unit_and_has_the_size_of_shot():
+    settings = Geovec.Settings(channels=20, eigenfunctions=60, largest=750.0)
+    geovec, mesh = Geovec(settings), bumpy_sphere(2, 3)
+    found = described(mesh, geovec)
+    np.testing.assert_allclose(described(moved(mesh), geovec), found, atol=2e-3)
+    np.testing.assert_allclose(np.linalg.norm(found, axis=1), np.sqrt(20 / 544), rtol=1e-4)

@@ -42,6 +42,13 @@ def test_only_requested_rows_are_computed_and_they_are_cached(reference, monkeyp
     assert len(computed) == BLOCK
 
 
+def test_all_rows_can_be_computed_before(reference, monkeypatch):
+    reference.prepare()
+    monkeypatch.setattr(GeodesicSolver, "row", None)  # computing now fails
+    again = ReferenceDistances(reference.template, reference._cache)
+    assert (again(np.arange(642), np.roll(np.arange(642), 1)) > 0).all()
+
+
 def test_the_rows_in_memory_are_bounded(reference, monkeypatch):
     monkeypatch.setattr("meshspiral.data.reference.IN_MEMORY", 1)
     rng = np.random.default_rng(1)

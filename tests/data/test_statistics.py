@@ -5,6 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from meshspiral.data.damaged import Damaged
+from meshspiral.data.settings import DamageSettings
 from meshspiral.data.shapes import ShapeSet, registered_shape
 from meshspiral.data.sources import open_shapes
 from meshspiral.data.statistics import (
@@ -102,3 +104,13 @@ def test_registered_shapes_share_all_edges_and_remeshed_ones_few(tmp_path):
     assert shared_edges(*registered) == 1
     assert len(labelled_edges(registered[0])) == len(registered[0].mesh.faces) * 3 // 2
     assert 0 < shared_edges(*map(shapes.load, names)) < 0.5
+
+
+def test_damaged_shapes_are_compared_to_what_was_remeshed(remeshed):
+    damage = DamageSettings(
+        **dict.fromkeys(("noise", "warp", "share", "cut", "hole_radius", "missing", "size"), 0.0),
+        holes=0,
+        seed=0,
+    )
+    name = remeshed.names["test"][0]
+    assert mesh_statistics(remeshed.load(name), None, Damaged(remeshed, damage), name).as_source

@@ -220,11 +220,11 @@ def test_distances_are_between_the_straight_line_and_the_path_along_edges(mesh):
 # ---------------------------------------------------------------------------------------- windows
 
 
-def literal_windows(mesh, v, radius, rings, rays) -> np.ndarray:
+def literal_windows(mesh, v, radius, rings, rays, width=2.0) -> np.ndarray:
     """The rows of v in a planar mesh, [rings * rays, V], by the formulae of `gaussian_windows`."""
     r, t = planar(mesh, v)
     m = (np.arange(rings) + 0.5) * radius / rings
-    ring = np.exp(-(((r[:, None] - m) / (2 * radius / rings)) ** 2))
+    ring = np.exp(-(((r[:, None] - m) / (width * radius / rings)) ** 2))
     ring[:, 0] = 1 / (1 + np.exp((r - m[0]) / (2 * m[0])))
     ring /= ring.sum(1, keepdims=True)
     ray = np.empty((len(r), rays))
@@ -243,13 +243,15 @@ def literal_windows(mesh, v, radius, rings, rays) -> np.ndarray:
     return weights / weights.sum(1, keepdims=True)
 
 
-@pytest.mark.parametrize("rings, rays", [(5, 16), (3, 7), (1, 1)])
-def test_weights_follow_the_formulae(rings, rays):
+@pytest.mark.parametrize(
+    "rings, rays, width", [(5, 16, 2.0), (3, 7, 2.0), (1, 1, 2.0), (5, 16, 0.2)]
+)
+def test_weights_follow_the_formulae(rings, rays, width):
     mesh = plane(2)
-    table = dense(gaussian_windows(mesh, 0.25, rings, rays), len(mesh.vertices))
+    table = dense(gaussian_windows(mesh, 0.25, rings, rays, width=width), len(mesh.vertices))
     for v in range(0, len(mesh.vertices), 30):
         rows = table[v * rings * rays : (v + 1) * rings * rays]
-        expected = literal_windows(mesh, v, 0.25, rings, rays)
+        expected = literal_windows(mesh, v, 0.25, rings, rays, width)
         assert ((rows > 0).sum(1) > 1).any()
         np.testing.assert_allclose(rows, expected, atol=1e-6)
 

@@ -43,3 +43,14 @@ def test_vertices_without_a_label_do_not_count(tmp_path):
     assert (entry.unsure, round(entry.median, 3)) == (0.0, 0.8)
     match(tmp_path / "none", [0.0], template=[-1])
     assert read_entry(tmp_path, "none").unsure == 1.0
+
+
+def test_the_confidence_of_the_map_decides_where_there_is_one(tmp_path):
+    for name, near, whole in (("a", 0.9, 0.1), ("b", 0.2, 0.8)):
+        match(tmp_path / name, [near])
+        template, near = np.zeros(1, int), np.float32([near])
+        confidences = {"near_confidence": near, "map_confidence": np.float32([whole])}
+        np.savez(tmp_path / name / "match.npz", template=template, **confidences)
+    write_index(tmp_path, ["a", "b"], [])
+    html = (tmp_path / "index.html").read_text()
+    assert re.findall(r'href="(.*?)"', html) == ["a/remarks.txt", "b/remarks.txt"]

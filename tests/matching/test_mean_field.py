@@ -53,6 +53,22 @@ def test_one_step_is_that_of_the_definition(monkeypatch):
     assert (found == expected).mean() > 0.999  # float32 may decide between equals otherwise
 
 
+def test_on_a_dense_mesh_a_message_passes_several_edges(monkeypatch):
+    monkeypatch.setattr(mean_field, "STEPS", 1)
+    template, rng = bumpy_sphere(subdivisions=2), np.random.default_rng(1)
+    places, size = template.vertices, template.size
+    scores = torch.from_numpy(rng.normal(size=(len(SPHERE.vertices), 162)).astype(np.float32) * 4)
+    log_probability = torch.log_softmax(scores, 1).numpy()
+    apart = np.linalg.norm(places[:, None] - places, axis=2) / size
+    kernel = np.where(apart <= REACH * WIDTH, np.exp(-((apart / WIDTH) ** 2) / 2), 0)
+    field = np.exp(log_probability)
+    for _ in range(4):  # 642 vertices, four times as many
+        field = neighbour_mean(SPHERE) @ field
+    expected = (log_probability + STRENGTH * field @ kernel).argmax(axis=1)
+    found = MeanField(template)(log_probability, SPHERE)
+    assert (found == expected).mean() > 0.99
+
+
 @pytest.mark.parametrize("mesh", [SPHERE, punctured(SPHERE, 0.1)])
 def test_scattered_errors_take_the_labels_of_their_neighbours(mesh):
     labels = np.arange(len(SPHERE.vertices))

@@ -20,12 +20,12 @@ def sampled(radius=0.4, rings=2, rays=5, blend=False, relative_to="area", **star
     return Sampled(Sampled.Settings(name="sampled", **settings))
 
 
-def patch(radius=0.1, rings=3, rays=8, weights="interpolation") -> Patch:
+def patch(radius=0.1, rings=3, rays=8, weights="interpolation", ring_width=2.0) -> Patch:
     settings = {
         "radius": radius,
         "rings": rings,
         "rays": rays,
         "weights": weights,
-        "ring_width": 2.0,
+        "ring_width": ring_width,
     }
     return Patch(Patch.Settings(name="patch", **settings))

@@ -7,12 +7,12 @@ from itertools import pairwise
 import numpy as np
 import torch
 
+from meshspiral.geometry import patches as module
 from meshspiral.geometry.geodesics import diameter
 from meshspiral.geometry.mesh import Mesh
-from meshspiral.geometry.patches import geodesic_patches
+from meshspiral.geometry.patches import first_directions, geodesic_patches
 from meshspiral.geometry.windows import gaussian_windows
-from meshspiral.neighbourhoods import patch as module
-from meshspiral.neighbourhoods.patch import by_rows_and_columns, first_directions
+from meshspiral.neighbourhoods.patch import by_rows_and_columns
 from tests.conftest import toy_shapes
 from tests.meshes import bumpy_sphere, lattice
 from tests.neighbourhoods.made import patch

@@ -9,6 +9,8 @@ import torch
 from meshspiral.data.descriptors import Features
 from meshspiral.data.descriptors.xyz import Xyz
 from meshspiral.data.tensors import mesh_tensors
+from meshspiral.geometry.geodesics import diameter
+from meshspiral.geometry.patches import first_directions
 from meshspiral.geometry.sampling import nearest_corners, sampled_places, surface_directions
 from meshspiral.geometry.shot import local_frames
 from meshspiral.neighbourhoods.sampled import turned_columns
@@ -95,12 +97,22 @@ def test_blended_features_are_those_interpolated_at_the_places(start):
     np.testing.assert_allclose(apart[:, 0], 0, atol=1e-6)
     edges = mesh.vertices[mesh.faces] - mesh.vertices[np.roll(mesh.faces, 1, axis=1)]
     assert apart.mean() > 0 and apart.max() < 0.6 * np.linalg.norm(edges, axis=2).max()
+    if start == "frame":
+        axes = local_frames(mesh.centred, 0.8 * mesh.size)[:, 0]
+        directions = surface_directions(mesh, axes)
+        known = np.isfinite(directions)
+        directions = np.where(known, directions, first_directions(mesh))
+        table = sampled_places(mesh, 0.4 * mesh.size, 2, 5, directions)
+        expected = np.einsum("vlk,vlkx->vlx", table.weights, mesh.vertices[table.indices])
+        np.testing.assert_allclose(blended[known], expected[known], atol=1e-5)
 
 
 def test_the_diameter_is_another_unit():
     mesh = bumpy_sphere()
-    tensors = [tensors_of(mesh, sampled(0.2, relative_to=unit)) for unit in ("area", "diameter")]
-    assert not torch.equal(tensors[0]["sequences"], tensors[1]["sequences"])
+    radius = 0.2 * diameter(mesh) / mesh.size
+    one, other = sampled(0.2, relative_to="diameter"), sampled(radius)
+    tensors = [tensors_of(mesh, neighbourhood) for neighbourhood in (one, other)]
+    assert torch.equal(tensors[0]["sequences"], tensors[1]["sequences"])
 
 
 @pytest.mark.parametrize("network", [FCSNet, LSTMNet])

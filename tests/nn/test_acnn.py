@@ -88,3 +88,15 @@ def test_renumbering_a_mesh_renumbers_the_scores():
 def test_gcnn3_reads_the_kernels_too():
     neighbourhood = kernels()
     assert GCNN3.options(neighbourhood) == {"rings": 2, "rays": 4} == ACNN.options(neighbourhood)
+
+
+def test_the_network_is_the_stack_of_its_layers():
+    around, net = served(bumpy_sphere(), kernels()), make().double().eval()
+    x = torch.randn(162, 10, dtype=torch.float64)
+    for norm in net.norms:  # not the identity
+        torch.nn.init.uniform_(norm.running_mean)
+    net.feature_scale = 3.0
+    expected = torch.relu(net.lift(3 * x))
+    for layer, norm in zip(net.layers, net.norms, strict=True):
+        expected = norm(torch.relu(layer(expected, around)))
+    torch.testing.assert_close(net(x, around), net.head(net.neck(expected)))

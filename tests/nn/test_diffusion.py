@@ -129,3 +129,16 @@ def test_meshes_smaller_than_the_basis_and_in_pieces_are_borne():
     for mesh in (icosphere(1), union(bumpy_sphere(0), bumpy_sphere(1))):
         x = torch.randn(len(mesh.vertices), 10, dtype=torch.float64)
         assert torch.isfinite(make()(x, operators(mesh, 128))).all()
+
+
+def test_the_network_is_the_stack_of_its_layers():
+    mesh, x = bumpy_sphere(), torch.randn(162, 10, dtype=torch.float64)
+    net, around = make(), operators(mesh)
+    net.feature_scale = 3.0
+    expected = net.lift(3 * x)
+    for each in net.blocks:
+        diffused = each.diffusion(expected, around)
+        gradients = resample(diffused, around.gradients).view(162, 2, -1)
+        read = torch.cat([expected, diffused, each.features(gradients)], dim=1)
+        expected = expected + each.perceptron(read)
+    torch.testing.assert_close(net(x, around), net.head(expected), atol=1e-6, rtol=1e-6)

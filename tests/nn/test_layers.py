@@ -124,6 +124,7 @@ def test_spiral_linear_under_autocast_multiplies_in_bf16_and_sums_in_float32():
     for a, b in zip(actual, reference, strict=True):
         assert a.dtype == torch.float32
         torch.testing.assert_close(a, b, rtol=0, atol=0.01 * float(b.abs().max()))
+    assert (actual[2] == 3000).all()  # a sum in bf16 would end near 256
 
 
 def test_spiral_linear_rejects_another_length():

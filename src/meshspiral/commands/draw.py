@@ -17,7 +17,6 @@ def main(config: DrawConfig) -> None:
     import numpy as np
 
     from meshspiral.data.files import write_file
-    from meshspiral.data.remeshed import Remeshed
     from meshspiral.data.sources import open_shapes
     from meshspiral.data.tensors import sequence_points
     from meshspiral.neighbourhoods import Neighbourhood
@@ -32,11 +31,8 @@ def main(config: DrawConfig) -> None:
     if config.vertex >= count:
         raise ConfigError(f"vertex must be below {count}, the template's size, got {config.vertex}")
     shapes.prepare([name])
-    drawn = {"as remeshed": shapes.load(name)}
-    if isinstance(shapes, Remeshed):
-        drawn = {"as registered": shapes.source(name)} | drawn
-    else:
-        drawn = {name: drawn["as remeshed"]}
+    shape, source = shapes.load(name), shapes.source(name)
+    drawn = {name: shape} if source is None else {"as registered": source, "as remeshed": shape}
     wanted, panels = shapes.template.vertices[config.vertex], []
     for tessellation, shape in drawn.items():
         apart = np.linalg.norm(shapes.template.vertices[shape.labels] - wanted, axis=1)
@@ -47,7 +43,8 @@ def main(config: DrawConfig) -> None:
             panels.append((f"{tessellation}: {around.title}", shape.mesh, vertex, points))
     figure = neighbourhood_figure(panels, columns=len(config.neighbourhoods))
     for kind in KINDS:
-        path = Path(config.output).with_suffix(f".{kind}")
+        path = Path(f"{config.output}.{kind}")
+        path.parent.mkdir(parents=True, exist_ok=True)
         write_file(path, encoded(figure, kind))
         log.info("Written: %s", path)
 

@@ -21,6 +21,7 @@ def main(config: PreprocessConfig) -> None:
     began = time.perf_counter()
     with on_cluster(config.scheduler):
         data.prepare(splits)
+    data.reference.prepare()
     seconds = time.perf_counter() - began
     meshes = sum(len(data.datasets[split]) for split in splits)
     size = data.cache.size() / 1e6

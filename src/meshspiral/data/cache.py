@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import ast
 import contextlib
 import inspect
 import logging
 import os
+import sys
 import zlib
 from collections.abc import Callable, Iterator
 from functools import cache
@@ -23,6 +25,7 @@ from meshspiral.neighbourhoods.base import Arrays
 
 log = logging.getLogger(__name__)
 SUFFIX = ".safetensors"
+GEOMETRY = "meshspiral.geometry"
 
 
 class CacheError(OSError):
@@ -31,8 +34,30 @@ class CacheError(OSError):
 
 @cache
 def code_version(*modules: ModuleType) -> str:
-    """A hash of the modules' source code, so that a change of code invalidates its results."""
-    return digest(*(inspect.getsource(module) for module in modules))
+    """A hash of source code, so that a change of code invalidates its results.
+
+    Args:
+        modules: Their code counts, and that of all modules of `meshspiral.geometry` that they
+            import, directly or not.
+    """
+    sources: dict[str, str] = {}
+    found = list(modules)
+    while found:
+        module = found.pop()
+        if module.__name__ not in sources:
+            sources[module.__name__] = source = inspect.getsource(module)
+            found += _geometry_imports(source)
+    return digest(*(sources[name] for name in sorted(sources)))
+
+
+def _geometry_imports(source: str) -> list[ModuleType]:
+    names = set()
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, ast.ImportFrom) and str(node.module).startswith(GEOMETRY):
+            names |= {node.module, *(f"{node.module}.{alias.name}" for alias in node.names)}
+        elif isinstance(node, ast.Import):
+            names |= {alias.name for alias in node.names if alias.name.startswith(GEOMETRY)}
+    return [sys.modules[name] for name in names & sys.modules.keys()]
 
 
 class Entry(NamedTuple):

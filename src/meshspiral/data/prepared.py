@@ -196,7 +196,11 @@ class Recipe:
         template = self.shapes.template
         parts = (*self.features.descriptors, self.neighbourhood)
         modules = [module for part in parts for module in (*part.modules, *sources(part))]
-        modules += [inspect.getmodule(type(self.shapes)), mesh_files, meshes, preprocessing, shot]
+        modules += [mesh_files, meshes, preprocessing, shot]
+        shapes: ShapeSet | None = self.shapes
+        while shapes:  # the data set, and those that it changes
+            modules.append(inspect.getmodule(type(shapes)))
+            shapes = shapes.base
         key = digest(
             template.vertices,
             template.faces,

@@ -45,6 +45,12 @@ class ReferenceDistances:
         cached = cache.get("diameter", self._key, self._compute_diameter)
         self.diameter = float(cached["diameter"])
 
+    def prepare(self) -> None:
+        """Compute and cache all distances."""
+        blocks = range(-(-len(self.template.vertices) // BLOCK))
+        for block in tqdm(blocks, desc="Geodesic distances", unit="block", leave=False, delay=1.0):
+            self._block(block)
+
     def __call__(self, sources: np.ndarray, targets: np.ndarray) -> np.ndarray:
         """Distances between pairs of vertices.
 

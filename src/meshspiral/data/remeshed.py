@@ -60,7 +60,7 @@ class Remeshed(ShapeSet):
             self._version = version("pymeshlab")
         except PackageNotFoundError as error:
             raise DataError("remeshing needs PyMeshLab: pip install pymeshlab") from error
-        self._base, self._cache, self._workers = base, cache, workers
+        self.base, self._cache, self._workers = base, cache, workers
         self._policy = policy
         self._vertices = vertices or usual_size(len(base.template.vertices))
         self.template, self.up = base.template, base.up
@@ -78,7 +78,7 @@ class Remeshed(ShapeSet):
         self._train, self._number = set(self.names["train"]), copies
 
     def prepare(self, names: list[str]) -> None:
-        self._base.prepare(sorted({self._original(name)[0] for name in names}))
+        self.base.prepare(sorted({self._original(name)[0] for name in names}))
         tasks = [self._tessellation(name)[1] for name in names]
         run_tasks(tasks, self._cache, self._workers, "Remeshing")
 
@@ -115,32 +115,23 @@ class Remeshed(ShapeSet):
 
     def stamp(self, name: str) -> str | None:
         original, copy = self._original(name)
-        stamp = self._base.stamp(original)
+        stamp = self.base.stamp(original)
         if stamp is None:
             return None
         code = code_version(remesh, meshes, sys.modules[__name__])
         settings = f"{self._policy}|{self._vertices}|{copy}|{len(self._shared)}"
         if pattern := self._pattern(name):
-            settings += f"|{self._base.stamp(pattern)}"
+            settings += f"|{self.base.stamp(pattern)}"
         return f"{stamp}|{settings}|{code}|{self._version}"
 
     def source(self, name: str) -> Shape:
-        """The original of a remeshed shape.
-
-        Args:
-            name: Name of the remeshed shape.
-
-        Raises:
-            DataError: There is no such shape, or its data are unusable.
-            MeshError: Its mesh is unusable.
-        """
-        return self._base.load(self._original(name)[0])
+        return self.base.load(self._original(name)[0])
 
     def _original(self, name: str) -> tuple[str, int]:
         """Name of the shape in the other data set, and the number of this copy, counted from 1."""
         name, epoch = epoch_of(name)
         original, copy = self._copies.get(name, (name, 1))
-        if self._base.fresh:
+        if self.base.fresh:
             return name_in(epoch, original), copy
         return original, copy + epoch * self._number
 
@@ -153,7 +144,7 @@ class Remeshed(ShapeSet):
     def _tessellation(self, name: str) -> tuple[Shape | None, Task]:
         """The shape whose tessellation a shape shares, None if it has its own; and its task."""
         if shared := self._pattern(name):
-            pattern = self._base.load(shared)
+            pattern = self.base.load(shared)
             return pattern, self._task(pattern.mesh, 1)
         return None, self._task(self.source(name).mesh, self._original(name)[1])
 

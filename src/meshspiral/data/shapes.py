@@ -106,6 +106,7 @@ class ShapeSet(ABC):
         up: The axis that points up in pictures, "y" or "z".
         fresh: Whether `load` knows other versions of the shapes to train on, one for each epoch, by
             names as `name_in` gives them.
+        base: The data set whose shapes this one changes, if it does.
     """
 
     registered: ClassVar[dict[str, type[ShapeSet]]] = {}
@@ -114,6 +115,7 @@ class ShapeSet(ABC):
     names: dict[str, list[str]]
     up = "y"
     fresh = False
+    base: ShapeSet | None = None
 
     def __init_subclass__(cls, name: str | None = None, **options: Any) -> None:
         super().__init_subclass__(**options)
@@ -130,6 +132,17 @@ class ShapeSet(ABC):
         read. Settings alone do not suffice where files can change; `file_stamp` helps.
         """
         return None
+
+    def source(self, name: str) -> Shape | None:
+        """The shape before it was remeshed; None if it was not.
+
+        Args:
+            name: As for `load`.
+
+        Raises:
+            DataError, MeshError: As `load` does.
+        """
+        return self.base and self.base.source(name)
 
     @abstractmethod
     def load(self, name: str) -> Shape:

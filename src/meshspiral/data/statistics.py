@@ -10,7 +10,6 @@ from typing import NamedTuple
 import numpy as np
 import trimesh
 
-from meshspiral.data.remeshed import Remeshed
 from meshspiral.data.shapes import Shape, ShapeSet
 from meshspiral.geometry.barycentric import interpolate
 from meshspiral.geometry.connectivity import fans
@@ -70,10 +69,9 @@ def mesh_statistics(
     mesh, solid = shape.mesh, _solid(shape.mesh)
     lengths = solid.edges_unique_length
     as_source = source_distance = label_distance = None
-    if isinstance(shapes, Remeshed):
-        source = shapes.source(name).mesh
-        as_source = _topology(solid) == _topology(_solid(source))
-        source_distance = hausdorff_distance(mesh, source) / lengths.mean()
+    if source := shapes.source(name):
+        as_source = _topology(solid) == _topology(_solid(source.mesh))
+        source_distance = hausdorff_distance(mesh, source.mesh) / lengths.mean()
     if shape.points is not None:
         template = shapes.template.vertices
         points = interpolate(template, *shape.points)

@@ -16,7 +16,7 @@ from meshspiral.experiment.run_folder import CONFIG, LAST, RunError, read_run_co
 from meshspiral.experiment.schema import TrainConfig, flat, read_config
 
 # how and where a run is computed, which may change when it is resumed
-MAY_CHANGE = ("trainer", "data.cache_dir", "data.workers", "picture", "plugins")
+MAY_CHANGE = ("trainer", "data.cache_dir", "data.workers", "data.readers", "picture", "plugins")
 # what of a run itself may change when it is resumed: its length, and its start before it began
 OF_THE_RUN = ("optim.epochs", "init")
 FREE = (*OF_THE_RUN, *MAY_CHANGE)

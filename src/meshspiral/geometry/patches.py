@@ -15,6 +15,7 @@ import numpy as np
 from numba import njit
 
 from meshspiral.geometry.connectivity import one_rings
+from meshspiral.geometry.digest import derived_seed
 from meshspiral.geometry.mesh import Mesh
 
 MOST_FACES = 10_000  # crossed by one ray; only damaged meshes reach this limit
@@ -90,6 +91,19 @@ def geodesic_patches(
         indices[missing] = missing.nonzero()[0][:, None]
         weights[missing] = 1.0, 0.0, 0.0
     return table
+
+
+def first_directions(mesh: Mesh) -> np.ndarray:
+    """Directions in which the grids begin: random, but always the same for one mesh.
+
+    With directions taken from the edges, a network could recognise the vertices of registered
+    meshes by them.
+
+    Returns:
+        float64 [V], in radians.
+    """
+    rng = np.random.default_rng(derived_seed(mesh.vertices, mesh.faces))
+    return rng.uniform(0, 2 * np.pi, len(mesh.vertices))
 
 
 def check_radius(radius: float) -> None:

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from pydantic import Field, field_validator
 
-from meshspiral.geometry import anisotropic, connectivity, curvature, geodesics, laplacian
+from meshspiral.geometry import anisotropic, curvature, geodesics
 from meshspiral.geometry.mesh import Mesh
 from meshspiral.neighbourhoods.base import Arrays, Neighbourhood
 from meshspiral.neighbourhoods.patch import by_rows_and_columns
@@ -25,7 +25,6 @@ class Anisotropic(Neighbourhood, name="anisotropic"):
     """
 
     gives, noun = "patches", "anisotropic heat kernels"
-    modules = (anisotropic, connectivity, curvature, geodesics, laplacian)
     density_range = 2.0
 
     class Settings(Neighbourhood.Settings):

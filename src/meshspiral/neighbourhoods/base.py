@@ -30,7 +30,8 @@ class Neighbourhood(ABC):
         registered: All neighbourhoods, by name.
         gives: Name of the batch entry that networks read; a network fits if its `reads` equals it.
         noun: What the tables hold, in the plural, for messages; by default the name.
-        modules: Modules whose source code is part of the cache key, beside the class's own.
+        modules: Modules whose source code is part of the cache key, beside that of the class and
+            of all geometry that it imports.
         density_range: Meshes with up to this many times more or fewer vertices than the training
             meshes are labelled as they are; others are resampled first.
     """

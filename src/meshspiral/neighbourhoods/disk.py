@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from pydantic import Field
 
-from meshspiral.geometry import connectivity, disks, patches, sampling, shot, windows
+from meshspiral.geometry import disks, sampling
 from meshspiral.geometry.mesh import Mesh
 from meshspiral.geometry.shot import Frame
 from meshspiral.neighbourhoods.base import Arrays, Neighbourhood
@@ -23,7 +23,6 @@ class Disk(Neighbourhood, name="disk"):
     """
 
     gives, noun = "disks", "geodesic disks"
-    modules = (connectivity, disks, patches, sampling, shot, windows)
     density_range = 4.0  # the radius follows the surface, not the edges
 
     class Settings(Neighbourhood.Settings):

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from pydantic import Field
 
-from meshspiral.geometry import connectivity, gradients, laplacian
+from meshspiral.geometry import gradients, laplacian
 from meshspiral.geometry.mesh import Mesh
 from meshspiral.neighbourhoods.base import Arrays, Neighbourhood
 from meshspiral.neighbourhoods.patch import by_rows_and_columns
@@ -22,7 +22,6 @@ class Operators(Neighbourhood, name="operators"):
     """
 
     gives, noun = "operators", "operators"
-    modules = (connectivity, gradients, laplacian)
     density_range = 4.0  # of a surface, not of its edges
 
     class Settings(Neighbourhood.Settings):

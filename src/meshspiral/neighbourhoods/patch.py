@@ -9,8 +9,7 @@ import torch
 from pydantic import Field, field_validator
 from scipy.sparse import csr_array
 
-from meshspiral.geometry import connectivity, geodesics, patches, windows
-from meshspiral.geometry.digest import derived_seed
+from meshspiral.geometry import geodesics, patches, windows
 from meshspiral.geometry.mesh import Mesh
 from meshspiral.neighbourhoods.base import Arrays, Neighbourhood
 
@@ -22,7 +21,6 @@ class Patch(Neighbourhood, name="patch"):
     """
 
     gives, noun = "patches", "patches"
-    modules = (connectivity, geodesics, patches, windows)
     density_range = 4.0  # the radius follows the surface, not the edges
 
     class Settings(Neighbourhood.Settings):
@@ -69,7 +67,7 @@ class Patch(Neighbourhood, name="patch"):
         """
         settings = self.settings
         radius = settings.radius * geodesics.diameter(mesh)
-        grid = (radius, settings.rings, settings.rays, first_directions(mesh))
+        grid = (radius, settings.rings, settings.rays, patches.first_directions(mesh))
         if settings.weights == "gaussian":
             indices, weights, first = windows.gaussian_windows(mesh, *grid, settings.ring_width)
         else:
@@ -89,19 +87,6 @@ class Patch(Neighbourhood, name="patch"):
     def tensors(self, arrays: Arrays, mesh: Mesh) -> dict[str, Any]:
         both = by_rows_and_columns(arrays, len(mesh.vertices))
         return {"patches": {name: torch.from_numpy(array) for name, array in both.items()}}
-
-
-def first_directions(mesh: Mesh) -> np.ndarray:
-    """Directions in which the grids begin: random, but always the same for one mesh.
-
-    With directions taken from the edges, a network could recognise the vertices of registered
-    meshes by them.
-
-    Returns:
-        float64 [V], in radians.
-    """
-    rng = np.random.default_rng(derived_seed(mesh.vertices, mesh.faces))
-    return rng.uniform(0, 2 * np.pi, len(mesh.vertices))
 
 
 def by_rows_and_columns(arrays: Arrays, vertices: int) -> Arrays:

@@ -9,10 +9,10 @@ import torch
 from pydantic import Field, field_validator
 from scipy.sparse import csr_array
 
-from meshspiral.geometry import connectivity, geodesics, patches, sampling, shot
+from meshspiral.geometry import geodesics, patches, sampling
 from meshspiral.geometry.mesh import Mesh
 from meshspiral.neighbourhoods.base import Arrays, Batch
-from meshspiral.neighbourhoods.patch import by_rows_and_columns, first_directions
+from meshspiral.neighbourhoods.patch import by_rows_and_columns
 from meshspiral.neighbourhoods.starts import (
     StartedSequences,
     StartSettings,
@@ -32,7 +32,6 @@ class Sampled(StartedSequences, name="sampled"):
     """
 
     gives, noun = "spirals", "sampled spirals"
-    modules = (connectivity, geodesics, patches, sampling, shot)
     density_range = 4.0
 
     class Settings(StartSettings):
@@ -92,7 +91,7 @@ class Sampled(StartedSequences, name="sampled"):
             [V * L, V] in rows, as `Patch.compute` returns it: `indices{t}`, `weights{t}` and
             `first{t}`.
         """
-        start, known = first_directions(mesh), np.zeros(len(mesh.vertices), bool)
+        start, known = patches.first_directions(mesh), np.zeros(len(mesh.vertices), bool)
         if frames is not None:
             directions = sampling.surface_directions(mesh, frames[:, 0])
             known = np.isfinite(directions)

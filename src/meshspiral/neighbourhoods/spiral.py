@@ -28,7 +28,6 @@ class Spiral(StartedSequences, name="spiral"):
     """
 
     gives, noun = "spirals", "spirals"
-    modules = (connectivity, spirals)
 
     class Settings(StartSettings):
         seq_len: int = Field(ge=1, description="number of vertices N of a spiral")

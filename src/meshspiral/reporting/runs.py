@@ -28,6 +28,7 @@ LEFT_OUT = {
     "trainer.strategy",
     "data.cache_dir",
     "data.workers",
+    "data.readers",
     "data.root",
     "data.benchmark_root",
     "picture",

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import functools
 import math
-from typing import Any
+from itertools import chain
+from typing import Any, TypeVar
 
 import lightning as L
 import numpy as np
@@ -21,6 +22,8 @@ from meshspiral.neighbourhoods.base import Batch
 from meshspiral.nn.calibration import fit_temperature
 from meshspiral.nn.loss import Points, Prediction, SoftLabels, linear_cross_entropy, predict
 from meshspiral.nn.networks import Network
+
+T = TypeVar("T")
 
 
 def build_network(config: TrainConfig, in_features: int, num_classes: int) -> Network:
@@ -56,7 +59,7 @@ def rate_factor(optim: OptimSettings, step: int, steps: int) -> float:
     return 0.5 * (1 + math.cos(math.pi * (step - warmup) / max(1, steps - warmup)))
 
 
-SAMPLES = 256  # of each validation mesh, to fit the temperature
+SAMPLES = 2048  # about so many vertices of all validation meshes fit the temperature
 CHECK_EVERY = 10  # steps between two checks of the loss on a GPU, each of which waits for it
 
 
@@ -150,8 +153,9 @@ class Correspondence(L.LightningModule):
         x = self.net.embed_batch(batch)
         found = predict(x, head.weight, head.bias, labels)
         if split == "val":
-            step = max(1, len(labels) // SAMPLES)
-            self._samples.append((x[::step], labels[::step]))
+            meshes = sum(self.trainer.num_val_batches) * self.trainer.world_size
+            step = math.ceil(meshes * len(labels) / SAMPLES)
+            self._samples.append((x[::step].cpu(), labels[::step].cpu()))
         predicted = found.classes.cpu().numpy()
         self.log(f"{split}/loss", found.loss, batch_size=1, sync_dist=True)
         result = result_of(predicted, batch, self.distances)
@@ -167,10 +171,10 @@ class Correspondence(L.LightningModule):
 
     def on_validation_epoch_end(self) -> None:
         self._report("val")
-        head = self.net.head
-        x, labels = (torch.cat(each) for each in zip(*self._samples, strict=True))
-        self._samples = []
-        scores = torch.addmm(head.bias, x.to(head.weight.dtype), head.weight.T)
+        samples, self._samples = self._of_all_processes(self._samples), []
+        x, labels = (torch.cat(each) for each in zip(*chain(*samples), strict=True))
+        weight, bias = self.net.head.weight.cpu(), self.net.head.bias.cpu()
+        scores = torch.addmm(bias, x.to(weight.dtype), weight.T)
         self.temperature = fit_temperature(scores, labels)
 
     def on_test_epoch_end(self) -> None:
@@ -184,10 +188,16 @@ class Correspondence(L.LightningModule):
         self.metrics[split] = {f"{split}/{name}": float(value) for name, value in values.items()}
         # the metrics cover the meshes of all ranks already
         self.log_dict(self.metrics[split], batch_size=1, sync_dist=True)
-        if self.trainer.world_size > 1:
-            shares: list[Any] = [None] * self.trainer.world_size
-            torch.distributed.all_gather_object(shares, self.results[split])
-            self.results[split] = {i: mesh for share in shares for i, mesh in share.items()}
+        shares = self._of_all_processes(self.results[split])
+        self.results[split] = {i: mesh for share in shares for i, mesh in share.items()}
+
+    def _of_all_processes(self, value: T) -> list[T]:
+        """A picklable value of each process, in the order of their ranks."""
+        if self.trainer.world_size == 1:
+            return [value]
+        values: list[Any] = [None] * self.trainer.world_size
+        torch.distributed.all_gather_object(values, value)
+        return values
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         data = self.trainer.datamodule

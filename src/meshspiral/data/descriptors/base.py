@@ -30,7 +30,8 @@ class Descriptor(ABC):
 
     Class attributes:
         registered: All descriptors, by name.
-        modules: Modules whose source code is part of the cache key, beside the class's own.
+        modules: Modules whose source code is part of the cache key, beside that of the class and
+            of all geometry that it imports.
         fitted: Name of a setting that is fitted to the training shapes if it is null, see `fit`.
     """
 

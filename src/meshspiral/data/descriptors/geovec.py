@@ -22,7 +22,6 @@ class Geovec(Descriptor, name="geovec"):
     isometries, reflections included. The bands are fitted to the training shapes.
     """
 
-    modules = (geovec, laplacian)
     fitted = "largest"
 
     class Settings(Strict):

@@ -22,8 +22,6 @@ class Hks(Descriptor, name="hks"):
     Times are logarithmically spaced in `TIMES`, over the surface area.
     """
 
-    modules = (laplacian,)
-
     class Settings(Strict):
         times: int = Field(ge=1, description="number of times, the channels")
         eigenfunctions: int = Field(ge=2, description="number of eigenfunctions of the Laplacian")

@@ -7,7 +7,7 @@ from pydantic import Field
 
 from meshspiral.data.descriptors.base import Descriptor
 from meshspiral.data.settings import Strict
-from meshspiral.geometry import barycentric, connectivity, patches, sampling, shot
+from meshspiral.geometry import barycentric, sampling
 from meshspiral.geometry.mesh import Mesh
 from meshspiral.geometry.shot import Frame
 
@@ -23,8 +23,6 @@ class Raw(Descriptor, name="raw"):
     from the vertex, and angle at the vertex from the place before on its ring; then the normal of
     the vertex itself.
     """
-
-    modules = (barycentric, connectivity, patches, sampling, shot)
 
     class Settings(Strict):
         radius: float = Field(

@@ -6,14 +6,13 @@ import numpy as np
 
 from meshspiral.data.descriptors.base import Descriptor
 from meshspiral.data.settings import ShotSettings
-from meshspiral.geometry import angles, shot
+from meshspiral.geometry import shot
 from meshspiral.geometry.mesh import Mesh
 
 
 class Shot(Descriptor, name="shot"):
     """Histograms of normals in a local frame: invariant to rotation, translation and scale."""
 
-    modules = (angles, shot)
     Settings = ShotSettings
 
     @property
