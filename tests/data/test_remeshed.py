@@ -225,6 +225,8 @@ def test_networks_train_on_remeshed_shapes(toy_overrides, tmp_path, model):
     metrics = run(tmp_path, [*toy_overrides, *REMESH, *model, "optim.epochs=1"])
     assert metrics.keys() >= helpers.METRICS
     outcome = Outcome.load(tmp_path / ERRORS)
+    mean = outcome.label_errors.mean(dtype=np.float64)
+    assert metrics["test/geodesic_error_to_label"] == pytest.approx(mean)
     assert (outcome.errors != outcome.label_errors).mean() > 0.9  # few true points are vertices
     assert json.loads((tmp_path / METRICS).read_text()) == metrics
 

@@ -33,7 +33,9 @@ def metric_lines(outcome: Outcome, metrics: Mapping[str, float]) -> list[str]:
     errors = {
         "mean geodesic error / sqrt(area)": "geodesic_error",
         "mean geodesic error / diameter": "geodesic_error_diameter",
+        "mean error to the labelled vertex": "geodesic_error_to_label",
     }
+    errors = {title: key for title, key in errors.items() if f"test/{key}" in metrics}
     return [
         f"Test on {len(names)} unseen meshes ({names[0]} .. {names[-1]}), "
         f"{len(outcome.labels):,} vertices",
