@@ -32,8 +32,8 @@ from meshspiral.experiment.run_folder import (
 )
 from meshspiral.experiment.runs import claim, resumed_config
 from meshspiral.experiment.schema import read_stored_config
-from meshspiral.training.callbacks import Looks, Speed
-from meshspiral.training.checkpoints import Checkpoint, WholeFiles
+from meshspiral.training.callbacks import Figures, Speed
+from meshspiral.training.checkpoints import AtomicFiles, Checkpoint
 from meshspiral.training.module import Correspondence
 from meshspiral.training.run import train
 from tests import helpers
@@ -105,7 +105,7 @@ def test_metrics_and_plots_are_logged_to_tensorboard(whole_run):
 
 def test_plots_in_tensorboard_take_at_most_one_per_cent_of_the_time():
     """New plots wait until the earlier ones took less than 1 % of the time since the start."""
-    looks, drawn = Looks(), []
+    looks, drawn = Figures(), []
     looks._curve = lambda *arguments: (drawn.append(1), time.sleep(0.05))
     trainer = SimpleNamespace(state=SimpleNamespace(fn="fit"), is_global_zero=False)
     looks.on_train_start(trainer, None)
@@ -255,7 +255,7 @@ def test_a_stopped_run_resumes_to_the_same_weights(
     assert stopped.value.signum == signum
     assert (tmp_path / LAST).is_file() and not (tmp_path / METRICS).exists()
     saved = torch.load(tmp_path / LAST, weights_only=True)
-    assert saved["global_step"] == (6 if step == STEPS - 1 else step)  # see OrderlyStop
+    assert saved["global_step"] == (6 if step == STEPS - 1 else step)  # see GracefulStop
     monkeypatch.setattr(Speed, "on_train_batch_end", original)
     metrics = run(tmp_path, toy_overrides)
     assert same_weights(whole_run[0], tmp_path)
@@ -371,7 +371,7 @@ def test_a_signal_to_all_processes_of_a_run_with_readers_stops_in_order(toy_over
 
 
 def test_a_failed_write_leaves_the_previous_checkpoint(tmp_path, monkeypatch):
-    io = WholeFiles()
+    io = AtomicFiles()
     io.save_checkpoint({"a": torch.ones(3)}, tmp_path / "last.ckpt")
 
     def disk_full(descriptor):

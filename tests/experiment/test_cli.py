@@ -219,7 +219,7 @@ def test_help_shows_groups_settings_and_three_examples(cli):
         "model acnn, conv, diffusion, fcs, gcnn3, lstm, monet",
         "neighbourhood anisotropic, disk, operators, patch, sampled, spiral",
         "trainer cpu, ddp, gpu",
-        "data/remesh isotropic, mixed",
+        "data/remesh isotropic, mixed, scans",
         "seq_len number of vertices N of a spiral",
         "optim.lr largest learning rate",
         "data.shot.bins bins of the cosine; 16 give 544 channels",

@@ -36,7 +36,7 @@ from meshspiral.experiment.sweeps import (
     run_folder,
     sweep_folder,
 )
-from meshspiral.training.callbacks import OrderlyStop
+from meshspiral.training.callbacks import GracefulStop
 from tests import helpers
 from tests.helpers import QUICK, ROOT, composed, program_process, run, wait_for, weights
 
@@ -268,7 +268,7 @@ def test_a_signal_to_one_process_of_several_stops_all(toy_overrides, tmp_path):
 
 
 def test_a_signal_during_the_all_reduce_stops_at_the_next_step(tmp_path):
-    stop = OrderlyStop(tmp_path)
+    stop = GracefulStop(tmp_path)
 
     def agree(decision, all):
         stop.signum = signal.SIGINT  # comes after this process reported no signal

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from meshspiral.geometry.mesh import Mesh, MeshError, in_use
+from meshspiral.geometry.mesh import Mesh, MeshError, used_vertices
 from tests.meshes import bumpy_sphere, lattice
 
 SQUARE = [[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]]
@@ -91,7 +91,7 @@ def test_renumbered_is_the_same_surface():
 
 
 def test_vertices_in_use_and_faces_as_indices_of_them():
-    used, faces = in_use(np.array([[7, 2, 9], [9, 2, 4]]))
+    used, faces = used_vertices(np.array([[7, 2, 9], [9, 2, 4]]))
     assert used.tolist() == [2, 4, 7, 9]
     assert faces.tolist() == [[2, 0, 3], [3, 0, 1]]
 

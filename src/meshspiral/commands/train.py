@@ -17,8 +17,8 @@ from meshspiral.experiment.runs import (
     InUse,
     alone,
     claim,
-    in_use,
     is_first,
+    is_locked,
     may_change,
     resumed_config,
 )
@@ -100,7 +100,7 @@ def train_separately(folder: Path, overrides: list[str]) -> None:
         process.send_signal(stopped.signum)  # once, and to this process alone
         process.wait()
         raise
-    if code and in_use(folder):
+    if code and is_locked(folder):
         raise InUse(f"another process is training in {folder}")
     if code:
         raise RunError(

@@ -11,7 +11,7 @@ from meshspiral.data.settings import DamageSettings
 from meshspiral.data.shapes import Shape, ShapeSet, SurfacePoints, epoch_of
 from meshspiral.geometry import holes
 from meshspiral.geometry.digest import derived_seed
-from meshspiral.geometry.mesh import Mesh, in_use
+from meshspiral.geometry.mesh import Mesh, used_vertices
 
 SMALLEST_HOLE = 0.02  # radius over the size of the shape
 WAVES = 4  # of a warp
@@ -78,7 +78,7 @@ def damaged(shape: Shape, settings: DamageSettings, rng: np.random.Generator) ->
         kept &= rng.random(len(faces)) >= rng.uniform(0, settings.missing)
         if len(np.unique(faces[kept])) >= LEAST * len(vertices):
             faces = faces[kept]
-    used, faces = in_use(faces)
+    used, faces = used_vertices(faces)
     points = shape.points and SurfacePoints(*(array[used] for array in shape.points))
     left = holes.close_holes(Mesh(vertices[used], faces, mesh.name, float(whole)))
     return Shape(left, shape.labels[used], shape.template_size, points)

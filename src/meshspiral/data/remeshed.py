@@ -14,7 +14,7 @@ from meshspiral.geometry import mesh as meshes
 from meshspiral.geometry import remesh
 from meshspiral.geometry.barycentric import interpolate
 from meshspiral.geometry.digest import derived_seed, digest
-from meshspiral.geometry.mesh import Mesh, in_use
+from meshspiral.geometry.mesh import Mesh, used_vertices
 
 FUSING = ("fused", "scans")  # policies that may join parts which are apart in another shape
 TEAR = 4.0  # growth at which a face tears; that of skin is mostly below
@@ -96,7 +96,7 @@ class Remeshed(ShapeSet):
                 )
             before, vertices = vertices, interpolate(source.mesh.vertices, corners, weights)
             if self._policy in FUSING:
-                used, faces = in_use(faces[~torn(before, vertices, faces)])
+                used, faces = used_vertices(faces[~torn(before, vertices, faces)])
                 vertices, corners, weights = vertices[used], corners[used], weights[used]
         mesh = Mesh(vertices, faces, source.mesh.name)
         template = self.template.vertices

@@ -10,7 +10,7 @@ import trimesh
 
 from meshspiral.data.mesh_files import read_arrays
 from meshspiral.geometry.holes import close_holes
-from meshspiral.geometry.mesh import Mesh, MeshError, in_use
+from meshspiral.geometry.mesh import Mesh, MeshError, used_vertices
 from meshspiral.geometry.repair import outwards
 from meshspiral.geometry.repair import repair as repair_arrays
 
@@ -88,7 +88,7 @@ def scan(vertices: np.ndarray, faces: np.ndarray, name: str, repair: bool = Fals
         raise MeshError(f"{name}: the extent must be {SMALLEST:g} to {LARGEST:g}, got {extent:.3g}")
     if not 0 < mesh.area < np.inf:
         raise MeshError(f"{name}: the surface area must be above 0, got {mesh.area:.3g}")
-    used, faces_of_used = in_use(mesh.faces)
+    used, faces_of_used = used_vertices(mesh.faces)
     new_index = np.full(len(mesh.vertices) + 1, -1)  # the last entry is that of vertex -1
     new_index[used] = np.arange(len(used))
     vertex_of, origin = new_index[vertex_of], origin[used]

@@ -70,7 +70,7 @@ def alone(folder: Path) -> Iterator[None]:
         lock.release()
 
 
-def in_use(folder: Path) -> bool:
+def is_locked(folder: Path) -> bool:
     """Whether another process is training in a folder."""
     try:
         with alone(folder):

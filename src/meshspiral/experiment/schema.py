@@ -27,7 +27,7 @@ from pydantic import (
     model_validator,
 )
 
-from meshspiral.data.settings import DataSettings, Text
+from meshspiral.data.settings import DataSettings, Strict, Text
 
 
 class ConfigError(ValueError):
@@ -41,10 +41,6 @@ class MissingPluginError(ConfigError):
 C = TypeVar("C", bound=BaseModel)
 
 
-class Settings(BaseModel, extra="forbid", strict=True, frozen=True):
-    """Settings that accept their declared types alone, and no other keys."""
-
-
 Plugins = Annotated[
     list[str],
     Field(description="modules to import, which register networks, neighbourhoods or data sets"),
@@ -53,7 +49,7 @@ Accelerator = Annotated[Literal["cpu", "gpu"], Field(description="cpu or gpu")]
 Threads = Annotated[int | None, Field(ge=1, le=1024, description="threads; null: one per core")]
 
 
-class OptimSettings(Settings):
+class OptimSettings(Strict):
     """Adam, and the course of its learning rate."""
 
     epochs: int = Field(ge=1, description="number of epochs")
@@ -77,7 +73,7 @@ class OptimSettings(Settings):
         return betas
 
 
-class TrainerSettings(Settings):
+class TrainerSettings(Strict):
     """Lightning's trainer."""
 
     accelerator: str = Field(description="cpu, gpu, or auto: a GPU if there is one")
@@ -92,7 +88,7 @@ class TrainerSettings(Settings):
     val_every: int = Field(ge=1, description="epochs from one validation to the next")
 
 
-class TrainConfig(Settings):
+class TrainConfig(Strict):
     """Settings of `train`."""
 
     seq_len: int = Field(ge=1, description="number of vertices N of a spiral")
@@ -138,7 +134,7 @@ class TrainConfig(Settings):
         return self
 
 
-class EvaluateConfig(Settings):
+class EvaluateConfig(Strict):
     """Settings of `evaluate`."""
 
     run: Text = Field(description="folder of a run")
@@ -171,7 +167,7 @@ class EvaluateConfig(Settings):
         return shapes
 
 
-class MatchConfig(Settings):
+class MatchConfig(Strict):
     """Settings of `match`."""
 
     source: Text | None = Field(description="mesh file: PLY, OBJ, OFF, STL or GLB")
@@ -240,7 +236,7 @@ class MatchConfig(Settings):
         return self
 
 
-class MeshesConfig(Settings):
+class MeshesConfig(Strict):
     """Settings of `meshes`."""
 
     data: SerializeAsAny[DataSettings]
@@ -250,7 +246,7 @@ class MeshesConfig(Settings):
     plugins: Plugins
 
 
-class PreprocessConfig(Settings):
+class PreprocessConfig(Strict):
     """Settings of `preprocess`."""
 
     data: SerializeAsAny[DataSettings]
@@ -264,7 +260,7 @@ class PreprocessConfig(Settings):
     plugins: Plugins
 
 
-class CacheConfig(Settings):
+class CacheConfig(Strict):
     """Settings of `cache`."""
 
     cache_dir: Text = Field(description="the folder of cached results")
@@ -278,7 +274,7 @@ class CacheConfig(Settings):
     )
 
 
-class DrawConfig(Settings):
+class DrawConfig(Strict):
     """Settings of `draw`."""
 
     data: SerializeAsAny[DataSettings]
@@ -303,7 +299,7 @@ class DrawConfig(Settings):
         return classes
 
 
-class ReportConfig(Settings):
+class ReportConfig(Strict):
     """Settings of `report`."""
 
     runs: Text = Field(description="folder that contains runs at any depth, or a pattern")
@@ -312,7 +308,7 @@ class ReportConfig(Settings):
     plugins: Plugins
 
 
-class BenchmarkConfig(Settings):
+class BenchmarkConfig(Strict):
     """Settings of `benchmark`."""
 
     vertices: Literal[1500, 6890] = Field(description="vertices of the mesh and of the template")
@@ -332,7 +328,7 @@ class BenchmarkConfig(Settings):
     plugins: Plugins
 
 
-class DoctorConfig(Settings):
+class DoctorConfig(Strict):
     """Settings of `doctor`."""
 
     cache_dir: Text = Field(description="folder of cached results")

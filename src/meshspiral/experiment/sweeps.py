@@ -21,7 +21,7 @@ from omegaconf import DictConfig, OmegaConf
 from meshspiral.data.files import legal_name, write_file
 from meshspiral.experiment.program import command_line
 from meshspiral.experiment.run_folder import CONFIG, LAST, METRICS
-from meshspiral.experiment.runs import in_use, is_first
+from meshspiral.experiment.runs import is_first, is_locked
 
 FAILED = "failed.txt"  # in the folder of a failed job: the reason, in one line
 COMMAND = "MESHSPIRAL_COMMAND"  # environment variable: the words of the command line
@@ -146,7 +146,7 @@ def job_states(folder: Path) -> list[tuple[str, str, str]]:
             exact, error = metrics["test/exact_match"], metrics["test/geodesic_error"]
             what = f"{100 * exact:.2f} % exact, error {error:.4f}"
             rows.append((job.name, "finished", f"{what}; but {reason}" if reason else what))
-        elif (job / CONFIG).is_file() and in_use(job):
+        elif (job / CONFIG).is_file() and is_locked(job):
             rows.append((job.name, "running", "in another process"))
         elif reason:
             rows.append((job.name, "failed", reason))

@@ -10,7 +10,7 @@ from numba import njit
 from meshspiral.geometry.connectivity import one_rings
 from meshspiral.geometry.mesh import Mesh
 from meshspiral.geometry.patches import check_radius, face_sectors, left_corners
-from meshspiral.geometry.windows import polar_coordinates
+from meshspiral.geometry.windows import polar_coordinates, wrapped
 
 
 class DiskTable(NamedTuple):
@@ -85,8 +85,7 @@ def _all_disks(
         for k in range(kept):
             u = order[(k + 1) * len(order) // kept - 1]
             indices[v, k + 1], distances[v, k + 1] = u, distance[u]
-            around = angle[u] - turn[v]
-            angles[v, k + 1] = around - 2 * np.pi * np.round(around / (2 * np.pi))
+            angles[v, k + 1] = wrapped(angle[u] - turn[v])
         longest = max(longest, kept + 1)
         for u in disk[:size]:
             distance[u] = np.inf

@@ -7,7 +7,7 @@ import potpourri3d
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
-from meshspiral.geometry.mesh import Mesh, MeshError, in_use
+from meshspiral.geometry.mesh import Mesh, MeshError, used_vertices
 
 
 class GeodesicSolver:
@@ -29,7 +29,7 @@ class GeodesicSolver:
     def __init__(self, mesh: Mesh):
         if mesh.area == 0:
             raise MeshError(f"{mesh.name}: no surface area, so there are no geodesic distances")
-        self._used, faces = in_use(mesh.faces)
+        self._used, faces = used_vertices(mesh.faces)
         self._solver_index = np.full(len(mesh.vertices), -1)  # of every vertex; -1 on no face
         self._solver_index[self._used] = np.arange(len(self._used))
         self.component = _components(mesh)

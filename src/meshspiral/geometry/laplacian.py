@@ -52,6 +52,9 @@ def laplacian(mesh: Mesh) -> tuple[csc_array, np.ndarray]:
 def masses_of(mesh: Mesh) -> np.ndarray:
     """A third of the area of the faces of each vertex, and at least 1e-8 of the mean.
 
+    Args:
+        mesh: The surface, V vertices.
+
     Returns:
         float64 [V], in the square of the mesh's unit.
 
@@ -69,6 +72,9 @@ def spectrum(mesh: Mesh, count: int) -> Spectrum:
     Args:
         mesh: The surface.
         count: Number of eigenfunctions K; a mesh of fewer vertices has as many as vertices.
+
+    Returns:
+        K eigenvalues, ascending; functions, with columns orthonormal under the masses; and masses.
 
     Raises:
         MeshError: The surface has no area, or ARPACK finds no solution.

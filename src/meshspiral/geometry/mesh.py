@@ -114,7 +114,7 @@ class Mesh:
 
     @cached_property
     def mean_edge(self) -> float:
-        """The mean length of the faces' edges, an edge of two faces counted twice."""
+        """Mean length of the faces' edges in the mesh's unit; an edge of two faces counts twice."""
         corners = self.vertices[self.faces]
         return float(np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).mean())
 
@@ -159,7 +159,7 @@ class Mesh:
         return Mesh(self.vertices, faces, self.name, self.whole)
 
 
-def in_use(faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def used_vertices(faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """The vertices that faces name, and the faces renumbered to these.
 
     Args:

@@ -166,7 +166,7 @@ def bending(mesh: Mesh, radius: float) -> np.ndarray:
     Returns:
         float64 [V], in 0..1.
     """
-    radius = max(radius, 2 * mean_edge(mesh.area, len(mesh.vertices)))
+    radius = max(radius, 2 * equilateral_edge(mesh.area, len(mesh.vertices)))
     normals = np.nan_to_num(mesh.vertex_normals)
     one, other = cKDTree(mesh.vertices).query_pairs(radius, output_type="ndarray").T
     agree = np.einsum("px,px->p", normals[one], normals[other]) > 0
@@ -178,7 +178,7 @@ def bending(mesh: Mesh, radius: float) -> np.ndarray:
     return 1 - np.linalg.norm(total, axis=1) / count
 
 
-def mean_edge(area: float, vertices: int) -> float:
+def equilateral_edge(area: float, vertices: int) -> float:
     """The edge length of a closed mesh of equilateral triangles.
 
     Args:
@@ -216,7 +216,7 @@ class Tool:
             raise MeshError("remeshing needs PyMeshLab: pip install pymeshlab") from error
         self._lab, self.source, self.vertices, self._rng = pymeshlab, mesh, vertices, rng
         self.area = mesh.area
-        self.edge = mean_edge(self.area, vertices)
+        self.edge = equilateral_edge(self.area, vertices)
         self.reset()
 
     def reset(self) -> None:

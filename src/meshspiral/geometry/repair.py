@@ -11,7 +11,7 @@ from scipy.sparse.csgraph import connected_components
 
 from meshspiral.geometry.faces import directed_edges, without_repeats
 from meshspiral.geometry.holes import close_holes
-from meshspiral.geometry.mesh import Mesh, MeshError, in_use
+from meshspiral.geometry.mesh import Mesh, MeshError, used_vertices
 
 CLEARLY = 0.05  # share of the volume of a sphere, see `outwards`
 
@@ -100,7 +100,7 @@ def repair(vertices: np.ndarray, faces: np.ndarray, name: str) -> Repaired:
     note(cuts, "edges cut open where faces cannot be turned to agree")
     origin = origin[copied]
 
-    used, faces = in_use(faces)
+    used, faces = used_vertices(faces)
     new_index = np.full(len(joined) + 1, -1)  # the last element is that of index -1
     new_index[origin[used][::-1]] = np.arange(len(used))[::-1]  # the first copy of a vertex counts
     mesh = close_holes(Mesh(vertices[used], faces, name))

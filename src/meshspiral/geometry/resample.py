@@ -13,7 +13,7 @@ import numpy as np
 import trimesh
 
 from meshspiral.geometry.faces import surplus, without_repeats
-from meshspiral.geometry.mesh import Mesh, MeshError, in_use
+from meshspiral.geometry.mesh import Mesh, MeshError, used_vertices
 from meshspiral.geometry.remesh import closest_points
 
 POINTS = 20_000  # points projected at a time
@@ -66,7 +66,7 @@ def resampled(mesh: Mesh, vertices: int) -> Mesh:
 
     if not len(mesh.faces):
         raise MeshError(f"{mesh.name}: no faces, so there is no surface to resample")
-    used, faces = in_use(mesh.faces)
+    used, faces = used_vertices(mesh.faces)
     points = mesh.vertices[used]
     while len(points) < vertices:
         points, faces = trimesh.remesh.subdivide(points, faces)
@@ -78,7 +78,7 @@ def resampled(mesh: Mesh, vertices: int) -> Mesh:
     faces = without_repeats(faces)
     while len(faces) and len(extra := surplus(faces, len(points))):
         faces = np.delete(faces, extra, axis=0)
-    used, faces = in_use(faces)
+    used, faces = used_vertices(faces)
     if len(used) < 4:
         raise MeshError(
             f"{mesh.name}: nothing is left of the surface when it is resampled to "

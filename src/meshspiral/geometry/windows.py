@@ -189,7 +189,7 @@ def _rings_and_rays(r, t, radius, width, log_ring, log_ray):
     for i in range(1, len(log_ring)):
         log_ring[i] = -(((r - (i + 0.5) * step) / (width * step)) ** 2)
     for j in range(len(log_ray)):
-        offset = _wrapped(t - (j + 0.5) * 2 * np.pi / len(log_ray))
+        offset = wrapped(t - (j + 0.5) * 2 * np.pi / len(log_ray))
         d = np.sin(offset) if abs(offset) < np.pi / 2 else 1.0
         log_ray[j] = -(d**2) / 0.01 if r > 0 else 0.0
     for logs in (log_ring, log_ray):
@@ -201,7 +201,7 @@ def _rings_and_rays(r, t, radius, width, log_ring, log_ray):
 
 
 @njit(cache=True)
-def _wrapped(angle):
+def wrapped(angle):
     """The same direction as an angle from -pi to pi."""
     return angle - 2 * np.pi * np.round(angle / (2 * np.pi))
 
@@ -296,7 +296,7 @@ def _third_corner(vertices, a, b, c, distance, angle):
             wedge = np.arctan2(base * y, y**2 - x * (base - x))
             part = np.arctan2((base - x) * cy - y * cx, (base - x) * cx + y * cy)
             # around v, the angle from b to a is not `wedge`, but within half a turn of it
-            apart = wedge + _wrapped(angle[a] - angle[b] - wedge)
+            apart = wedge + wrapped(angle[a] - angle[b] - wedge)
             return r, angle[b] + apart * part / wedge
     by_a, by_b = to_a + np.sqrt(cx**2 + cy**2), to_b + np.sqrt((cx - base) ** 2 + cy**2)
     return (by_a, angle[a]) if by_a < by_b else (by_b, angle[b])

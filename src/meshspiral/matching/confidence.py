@@ -16,6 +16,7 @@ from scipy.sparse import csr_array
 from scipy.sparse.csgraph import dijkstra
 from torch import Tensor
 
+from meshspiral.geometry.faces import directed_edges
 from meshspiral.geometry.mesh import Mesh
 
 RADIUS = 0.05  # of sqrt(area), the error up to which a match counts as right
@@ -58,10 +59,9 @@ def near_vertices(template: Mesh, radius: float = RADIUS) -> csr_array:
         float32 [K, K], 1 for each pair, also for a vertex and itself.
     """
     size, radius = len(template.vertices), radius * np.sqrt(template.area)
-    start, tip = template.faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2).T
+    start, tip = directed_edges(template.faces).T  # each once
     lengths = np.linalg.norm(template.vertices[start] - template.vertices[tip], axis=1)
-    keys, first = np.unique(start.astype(np.int64) * size + tip, return_index=True)
-    graph = csr_array((lengths[first], (keys // size, keys % size)), shape=(size, size))
+    graph = csr_array((lengths, (start, tip)), shape=(size, size))
     found = []
     for begin in range(0, size, ROWS):
         block = np.arange(begin, min(begin + ROWS, size))

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import numpy as np
 from scipy.sparse import csr_array, diags_array
+from scipy.special import softmax
 
 from meshspiral.geometry.faces import directed_edges
 from meshspiral.geometry.mesh import Mesh
@@ -51,13 +52,13 @@ class MeanField:
             int64 [W], the likeliest template vertex under the mean field.
         """
         mean = neighbour_mean(mesh)
-        hops = int(np.clip(round(len(mesh.vertices) / len(self._kernel.indptr[1:])), 1, MOST_HOPS))
+        hops = int(np.clip(round(len(mesh.vertices) / self._kernel.shape[0]), 1, MOST_HOPS))
         field = np.exp(log_probability)
         for _ in range(STEPS):
             for _ in range(hops):  # about as far on a dense mesh as on the template
                 field = mean @ field
             message = (self._kernel @ np.ascontiguousarray(field.T)).T
-            field = softmax(log_probability + STRENGTH * message)
+            field = softmax(log_probability + STRENGTH * message, axis=1)
         return field.argmax(axis=1)
 
 
@@ -91,9 +92,3 @@ def neighbour_mean(mesh: Mesh) -> csr_array:
     graph = ((graph + graph.T) > 0).astype(np.float32)
     degree = np.maximum(np.asarray(graph.sum(axis=1)).ravel(), 1)
     return csr_array(diags_array((1 / degree).astype(np.float32)) @ graph)
-
-
-def softmax(scores: np.ndarray) -> np.ndarray:
-    """Over the last axis."""
-    exponentials = np.exp(scores - scores.max(axis=-1, keepdims=True))
-    return exponentials / exponentials.sum(axis=-1, keepdims=True)

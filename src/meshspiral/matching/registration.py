@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
-import potpourri3d
 from scipy.sparse import diags_array
 from scipy.sparse.linalg import spsolve
 
 from meshspiral.geometry.barycentric import interpolate
+from meshspiral.geometry.laplacian import laplacian
 from meshspiral.geometry.mesh import Mesh
 from meshspiral.geometry.remesh import closest_points
 from meshspiral.matching.job import LabelledScan
@@ -32,7 +32,7 @@ def registered(labelled: LabelledScan, template: Mesh) -> tuple[np.ndarray, np.n
         template: Mesh with K vertices.
 
     Returns:
-        Positions, float64 [K, 3], in the mesh's unit and place; and the confidence of each, float
+        Positions, float64 [K, 3], in the mesh's coordinates; and the confidence of each, float
         [K]: 0 where no point of the mesh has a label near the vertex.
     """
     mesh, labels = labelled.scan.mesh, labelled.labels
@@ -43,16 +43,15 @@ def registered(labelled: LabelledScan, template: Mesh) -> tuple[np.ndarray, np.n
     weights = np.zeros(len(template.vertices))
     if sound.any():
         spanned = Mesh(np.nan_to_num(points), mesh.faces[sound])
-        face, place, far = closest_points(spanned, template.vertices, template.vertex_normals)
+        face, barycentric, far = closest_points(spanned, template.vertices, template.vertex_normals)
         corners = spanned.faces[face]
-        found = interpolate(mesh.vertices, corners, place)
-        sure = (confidence[corners] * place).sum(axis=1)
+        found = interpolate(mesh.vertices, corners, barycentric)
+        sure = (confidence[corners] * barycentric).sum(axis=1)
         weights = np.where(far < REACH * edge, np.maximum(sure, 1e-3), 0.0)
     if not weights.any():
         return np.full((len(weights), 3), np.nan), weights
-    laplacian = potpourri3d.cotan_laplacian(template.vertices, template.faces, denom_eps=1e-10)
-    masses = potpourri3d.vertex_areas(template.vertices, template.faces)
-    smooth = edge**2 * (diags_array(1 / np.maximum(masses, 1e-12)) @ laplacian)
+    stiffness, masses = laplacian(template)
+    smooth = edge**2 * (diags_array(1 / masses) @ stiffness)
     matrix = diags_array(weights) + STIFFNESS * (smooth.T @ smooth)
     return spsolve(matrix.tocsc(), weights[:, None] * found), weights
 

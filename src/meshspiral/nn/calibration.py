@@ -19,6 +19,9 @@ def fit_temperature(scores: Tensor, labels: Tensor) -> float:
     Args:
         scores: float [N, K], of samples that were not trained on.
         labels: Their classes, int64 [N].
+
+    Returns:
+        The temperature, between 1 / MOST and MOST.
     """
     of_label = scores.gather(1, labels[:, None])[:, 0]
     low, high = -math.log(MOST), math.log(MOST)

@@ -17,7 +17,7 @@ from meshspiral.nn.recurrence import recurrence
 METRIC_FEATURES = 2  # distance and angle
 # Initial bias of the forget gate. The centre is read first; after 20 elements the cell still holds
 # sigmoid(3)^20 = 38 % of it. With the usual bias of 1 it holds 0.2 %, and the layer hardly learns.
-REMEMBER = 3.0
+FORGET_BIAS = 3.0
 # Spirals gathered at a time. Smaller chunks took 5 % longer; larger ones only used more memory.
 ROWS = 2048
 
@@ -166,7 +166,7 @@ class SpiralLSTM(nn.Module):
             glorot(layer.weight, in_features + METRIC_FEATURES * metric, out_features)
         glorot(self.hidden.weight, out_features, out_features)
         nn.init.zeros_(self.input.bias)
-        nn.init.constant_(self.input.bias[out_features : 2 * out_features], REMEMBER)
+        nn.init.constant_(self.input.bias[out_features : 2 * out_features], FORGET_BIAS)
 
     def forward(self, features: Tensor, spirals: Tensor, metric: Tensor | None = None) -> Tensor:
         """Apply the layer. The backward pass can run only once (see `recurrence`).

@@ -116,14 +116,7 @@ class _LinearCrossEntropy(torch.autograd.Function):
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx, grad):
-        return (
-            *(
-                grad * g.to(grad.dtype) if g.dtype != grad.dtype else g * grad
-                for g in ctx.saved_tensors
-            ),
-            None,
-            None,
-        )
+        return *(grad * g.to(grad.dtype) for g in ctx.saved_tensors), None, None
 
 
 class Prediction(NamedTuple):

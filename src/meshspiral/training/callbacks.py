@@ -158,7 +158,7 @@ class Speed(Callback):
         self._earlier, self.waiting = state["seconds"], state.get("waiting", 0.0)
 
 
-class Looks(Callback):
+class Figures(Callback):
     """Draws for TensorBoard: the validation curve, and a validation shape coloured by its
     correspondence.
 
@@ -196,7 +196,7 @@ class Looks(Callback):
             trainer.logger.experiment.add_figure(f"{split}/curve", figure, trainer.current_epoch)
 
 
-class OrderlyStop(Callback):
+class GracefulStop(Callback):
     """Finishes the step on Ctrl-C or SIGTERM, saves last.ckpt, and raises `Stopped`.
 
     A second signal stops at once; last.ckpt is then that of the last complete epoch.

@@ -18,7 +18,7 @@ from meshspiral.geometry.mesh import Mesh
 BUNDLED_RUN = Path(__file__).parents[1] / "data" / "assets" / "bodies_run"
 
 
-class WholeFiles(TorchCheckpointIO):
+class AtomicFiles(TorchCheckpointIO):
     """Writes checkpoints that appear whole or not at all, also if the machine or the disk fails.
 
     The previous checkpoint stays until the new one is complete.

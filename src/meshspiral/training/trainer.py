@@ -13,8 +13,8 @@ from lightning.pytorch.loggers import TensorBoardLogger
 from lightning.pytorch.utilities.exceptions import MisconfigurationException
 
 from meshspiral.experiment.schema import ConfigError, TrainConfig
-from meshspiral.training.callbacks import Bar, Looks, OrderlyStop
-from meshspiral.training.checkpoints import Checkpoint, WholeFiles
+from meshspiral.training.callbacks import Bar, Figures, GracefulStop
+from meshspiral.training.checkpoints import AtomicFiles, Checkpoint
 from meshspiral.training.device import choose_precision, set_up_process
 
 
@@ -51,11 +51,11 @@ def build_trainer(config: TrainConfig, folder: Path, *callbacks: Callback) -> L.
             num_sanity_val_steps=0,
             use_distributed_sampler=False,  # ours repeat no mesh in a test
             enable_model_summary=False,
-            plugins=[WholeFiles()],
+            plugins=[AtomicFiles()],
             callbacks=[
                 Bar(),
-                Looks(),
-                OrderlyStop(folder),
+                Figures(),
+                GracefulStop(folder),
                 LearningRateMonitor("step"),
                 Checkpoint(
                     filename="best", monitor="val/geodesic_error", save_weights_only=True, **keep
