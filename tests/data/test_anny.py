@@ -12,6 +12,7 @@ from meshspiral.data.datasets import anny as module
 from meshspiral.data.datasets.anny import AGES, Anny, Surface, draw_person
 from meshspiral.data.datasets.bodies import Bodies
 from meshspiral.data.shapes import DataError
+from meshspiral.geometry.barycentric import interpolate
 from meshspiral.geometry.mesh import Mesh
 
 installed = pytest.mark.skipif(
@@ -59,6 +60,18 @@ def test_other_people_are_validated_and_tested_on(people):
     assert len({name.rpartition("_")[0] for name in everyone}) == 40 + 10 + 10
     with pytest.raises(DataError, match="no body is named 'train_0002_00'"):
         few.load("train_0002_00")
+
+
+def test_bodies_with_more_vertices_are_labelled_with_points_of_the_template(people):
+    assert people()._labels is None
+    shapes = people(surface=6890)
+    labels, size, points = shapes._labels
+    bodies = Bodies(6890).template
+    assert size == 1500 and len(labels) == 6890
+    found = interpolate(shapes.template.vertices, *points)
+    assert np.linalg.norm(found - bodies.vertices, axis=1).max() < 0.5 * shapes.template.mean_edge
+    rows = np.arange(6890)
+    np.testing.assert_array_equal(labels, points.corners[rows, points.weights.argmax(axis=1)])
 
 
 def test_without_anny_one_line_says_how_to_get_it(monkeypatch):

@@ -16,6 +16,7 @@ from meshspiral.data.dataset import EpochSampler
 from meshspiral.data.descriptors import Features
 from meshspiral.data.descriptors.raw import Raw
 from meshspiral.data.descriptors.shot import Shot
+from meshspiral.data.descriptors.xyz import Xyz
 from meshspiral.data.pool import run_in_pool
 from meshspiral.data.preprocessing import (
     descriptor_task,
@@ -49,10 +50,10 @@ class Toy(ShapeSet):
         return Shape(Mesh(mesh.vertices, mesh.faces, name), np.arange(162), 162)
 
 
-def prepared(cache, neighbourhood=None, seed=0, shapes=None, **options):
+def prepared(cache, neighbourhood=None, seed=0, shapes=None, features=FEATURES, **options):
     neighbourhood = neighbourhood or spiral(8)
     data = CorrespondenceData(
-        Toy(shapes), FEATURES, neighbourhood, cache, seed, workers=1, **options
+        Toy(shapes), features, neighbourhood, cache, seed, workers=1, **options
     )
     data.prepare()
     return data
@@ -64,15 +65,18 @@ def cache(tmp_path):
 
 
 class Recorder(L.LightningModule):
-    """Records the batches of every split."""
+    """Records an entry of the batches of every split."""
 
-    def __init__(self):
+    def __init__(self, recorded="spirals"):
         super().__init__()
+        self.recorded = recorded
         self.weight = torch.nn.Parameter(torch.zeros(()))
         self.batches = {"train": [], "val": []}
 
     def record(self, split, batch):
-        self.batches[split].append((batch["index"], batch["spirals"].clone(), self.current_epoch))
+        self.batches[split].append(
+            (batch["index"], batch[self.recorded].clone(), self.current_epoch)
+        )
 
     def training_step(self, batch, i):
         self.record("train", batch)
@@ -85,8 +89,8 @@ class Recorder(L.LightningModule):
         return torch.optim.SGD(self.parameters(), lr=0.1)
 
 
-def recorded(data, epochs=2):
-    module = Recorder()
+def recorded(data, epochs=2, entry="spirals"):
+    module = Recorder(entry)
     trainer = L.Trainer(max_epochs=epochs, accelerator="cpu", logger=False, barebones=True)
     trainer.fit(module, datamodule=data)
     return module.batches
@@ -139,6 +143,24 @@ def test_training_draws_new_spirals_in_every_epoch_and_validation_never(cache):
     orders = [[i for i, _, e in batches["train"] if e == epoch] for epoch in range(3)]
     assert all(sorted(order) == list(range(6)) for order in orders)
     assert orders[0] != orders[1] or orders[1] != orders[2]
+
+
+@pytest.mark.parametrize(
+    "entry, options",
+    [
+        ("spirals", {"neighbourhood": spiral(8, start="frame", jitter=1)}),
+        ("features", {"features": Features((Xyz(Xyz.Settings(rotate=True)),), 1.0)}),
+    ],
+)
+def test_jitter_and_rotations_are_drawn_in_training_alone(cache, entry, options):
+    batches = recorded(prepared(cache, **options), epochs=2, entry=entry)
+    one, other = (
+        {index: drawn for index, drawn, epoch in batches["train"] if epoch == e} for e in (0, 1)
+    )
+    assert not any(torch.equal(one[i], other[i]) for i in range(6))
+    validated = {}
+    for index, drawn, _ in batches["val"]:
+        assert torch.equal(validated.setdefault(index, drawn), drawn)
 
 
 def test_the_seed_determines_the_order_and_the_spirals(cache):

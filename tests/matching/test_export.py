@@ -8,14 +8,17 @@ import struct
 import numpy as np
 import pytest
 import trimesh
+from scipy.spatial.transform import Rotation
 
 from meshspiral import Matcher, scan
 from meshspiral.commands.match import main
 from meshspiral.data.datasets.bodies import Bodies
 from meshspiral.geometry.barycentric import interpolate
+from meshspiral.geometry.mesh import Mesh
+from meshspiral.matching import export
 from meshspiral.matching.confidence import Distributions
 from meshspiral.matching.dense import dense_map
-from meshspiral.matching.job import LabelledScan
+from meshspiral.matching.job import FileMatch, LabelledScan
 from meshspiral.matching.matcher import Labels
 from meshspiral.matching.morph import morph_glb
 from meshspiral.matching.pictures import align_to_template
@@ -65,6 +68,26 @@ def test_a_part_is_shown_in_the_size_that_it_has_in_the_whole():
     a, b, _ = SQUAT.vertices[SQUAT.faces].transpose(1, 0, 2)
     whole = np.median(np.linalg.norm(a - b, axis=1))
     assert sizes[1] / upper == pytest.approx(sizes[0] / whole, rel=0.15)
+
+
+def test_a_turned_body_is_shown_in_the_pose_of_the_template():
+    turn = Rotation.from_rotvec([0.3, 2.0, -0.7])
+    moved = Mesh(3 * turn.apply(TEMPLATE.vertices) + [5.0, -2, 1], TEMPLATE.faces)
+    labelled = perfect(moved)
+    shown = align_to_template(labelled.scan, labelled.labels, TEMPLATE)
+    off = shown.vertices - TEMPLATE.vertices
+    np.testing.assert_allclose(off - off.mean(axis=0), 0, atol=1e-6)
+
+
+def test_the_morph_turns_the_source_into_its_counterparts(monkeypatch):
+    monkeypatch.setattr(export, "morph_glb", lambda *shapes: shapes)
+    source, target = perfect(SQUAT), perfect(WALK)
+    match = FileMatch("a.ply", source, target, np.arange(1500), np.ones(1500, np.float32))
+    start, end, faces, _ = export.morph_of(match, TEMPLATE, "y")
+    for found, each in ((start, source), (end, target)):
+        shown = align_to_template(each.scan, each.labels, TEMPLATE).vertices
+        np.testing.assert_allclose(found, shown, atol=1e-5)
+    np.testing.assert_array_equal(faces, SQUAT.faces)
 
 
 def test_one_wrong_label_does_not_move_the_surface():

@@ -5,6 +5,7 @@ from __future__ import annotations
 from itertools import pairwise
 
 import numpy as np
+import pytest
 import torch
 
 from meshspiral.geometry import patches as module
@@ -71,13 +72,17 @@ def test_a_sample_that_left_the_surface_has_no_entries():
     np.testing.assert_allclose(by_rows.sum(3), whole, atol=1e-6)
 
 
-def test_gaussian_windows_are_served_in_the_same_order():
+@pytest.mark.parametrize("width", [2.0, 0.2])
+def test_gaussian_windows_are_served_in_the_same_order(width):
     mesh = bumpy_sphere()
-    table = gaussian_windows(mesh, 0.1 * diameter(mesh), 3, 8, first_directions(mesh))
+    grid = (0.1 * diameter(mesh), 3, 8, first_directions(mesh))
+    table = gaussian_windows(mesh, *grid, width)
     expected = np.zeros((162, 3, 8, 162))
     for row, (begin, end) in enumerate(pairwise(table.first)):
         expected.reshape(-1, 162)[row, table.indices[begin:end]] = table.weights[begin:end]
-    by_rows, by_columns = dense_samples(tensors(patch(weights="gaussian"), mesh), 3, 8)
+    by_rows, by_columns = dense_samples(
+        tensors(patch(weights="gaussian", ring_width=width), mesh), 3, 8
+    )
     np.testing.assert_array_equal(by_rows, expected.transpose(0, 2, 1, 3))
     np.testing.assert_array_equal(by_columns, by_rows)
 

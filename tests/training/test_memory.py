@@ -90,11 +90,11 @@ def test_long_spirals_are_foreseen_without_taking_their_memory():
     assert max(tallies) < states / 70
 
 
-@pytest.mark.parametrize("precision, ratio", [("64-true", 2.0), ("bf16-mixed", 1.15)])
+@pytest.mark.parametrize("precision, ratio", [("64-true", 2.0), ("bf16-mixed", 1.28)])
 def test_the_estimate_knows_the_precision(precision, ratio):
     _, net, data = a_network(["model=lstm"], 162)
     found = estimate_memory(net, data, precision).growth
-    assert found / estimate_memory(net, data, "32-true").growth == pytest.approx(ratio, rel=0.25)
+    assert found / estimate_memory(net, data, "32-true").growth == pytest.approx(ratio, rel=0.1)
     assert next(net.parameters()).dtype == torch.float32
 
 

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from pydantic import Field
+from scipy.spatial.transform import Rotation
 
 from meshspiral.data.descriptors.base import Descriptor
 from meshspiral.data.settings import Strict
@@ -42,14 +43,5 @@ def random_rotation(generator: torch.Generator) -> torch.Tensor:
     """A rotation, uniform among all, float64 [3, 3] (of a random unit quaternion)."""
     import torch
 
-    device = generator.device
-    q = torch.randn(4, generator=generator, device=device, dtype=torch.float64)
-    w, *v = q / q.norm()
-    x, y, z = v
-    return torch.stack(
-        [
-            torch.stack([1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)]),
-            torch.stack([2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)]),
-            torch.stack([2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)]),
-        ]
-    )
+    q = torch.randn(4, generator=generator, device=generator.device, dtype=torch.float64)
+    return torch.from_numpy(Rotation.from_quat(q.cpu().numpy()).as_matrix())
