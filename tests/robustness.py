@@ -18,7 +18,6 @@ from pathlib import Path
 
 import numpy as np
 import trimesh
-from scipy.spatial import cKDTree
 from tqdm import tqdm
 
 from meshspiral import Matcher, Mesh, scan
@@ -30,6 +29,7 @@ from meshspiral.data.remeshed import Remeshed
 from meshspiral.data.shapes import Shape
 from meshspiral.evaluation.metrics import geodesic_errors, point_errors
 from meshspiral.evaluation.outcome import evenly
+from meshspiral.matching.flips import mirror_images
 
 CACHE = Cache("outputs/cache")
 TESSELLATIONS = [  # policy, number of vertices
@@ -43,9 +43,9 @@ TESSELLATIONS = [  # policy, number of vertices
 OPTIONS = {
     "default": {},
     "unflip=false": {"unflip": False},
+    "ensemble=true": {"ensemble": True},
     "refine=crf": {"refine": "crf"},
     "refine=zoomout": {"refine": "zoomout"},
-    "resample=true": {"resampled": True},
 }
 
 
@@ -122,17 +122,10 @@ def main() -> None:
         remeshed.prepare(names)
         cases[f"{policy}, {vertices:,} vertices"] = [remeshed.load(name) for name in names]
     matchers = [Matcher.load(run, **options) for options in OPTIONS.values()]
-    mirror = mirrored(bodies.template)
+    mirror = mirror_images(bodies.template, bodies.up)
     print(f"{'':44}" + "".join(f"{name:>44}" for name in OPTIONS))
     for title, shapes in cases.items():
         print_row(title, [measure(matcher, shapes, reference, mirror) for matcher in matchers])
-
-
-def mirrored(template: Mesh) -> np.ndarray:
-    """The vertex nearest to the mirror image of each, int [K]; x points to the left."""
-    middle = template.vertices[:, 0].mean()
-    images = template.vertices * [-1, 1, 1] + [2 * middle, 0, 0]
-    return cKDTree(template.vertices).query(images)[1]
 
 
 def print_row(title: str, values: list[tuple[float, ...]]) -> None:

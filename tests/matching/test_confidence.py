@@ -130,7 +130,7 @@ def test_matches_of_bodies_with_high_confidence_are_right(smooth):
         scan(*(lambda m: (m.vertices, m.faces))(bodies.load(name).mesh), name)
         for name in (bodies.names["test"][3], bodies.names["test"][16])
     ]
-    match = Matcher.load(smooth=smooth).match(*scans)
+    match = Matcher.load(smooth=smooth, ensemble=False).match(*scans)
     distance = np.linalg.norm(
         bodies.template.vertices[match.target] - bodies.template.vertices, axis=1
     )

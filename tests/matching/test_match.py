@@ -90,7 +90,7 @@ def test_the_stages_of_a_match_are_reported(trained, files):
     settings = dict.fromkeys(MatchConfig.model_fields) | {"plugins": [], "accelerator": "cpu"}
     settings |= {"source": str(files / "a.ply"), "target": str(files / "b.ply")}
     settings |= {"run": str(trained), "smooth": True, "repair": False, "resample": True}
-    settings |= {"unflip": True}
+    settings |= {"unflip": True, "ensemble": False}
     job = MatchJob(MatchConfig(**settings), render=False)
     stages = []
     match_file(job, settings["source"], files / "out", lambda *stage: stages.append(stage))

@@ -188,6 +188,10 @@ class MatchConfig(Strict):
     unflip: bool = Field(
         description="put parts back that took left for right, if the template has both sides alike"
     )
+    ensemble: bool | None = Field(
+        description="average the predictions for the mesh and three resampled copies: more exact, "
+        "several times the time; null: with refine=, if the network was trained on remeshed shapes"
+    )
     scale: float | None = Field(
         gt=0,
         description="metres in a unit of the meshes, 0.001 for millimetres; null: radii follow "

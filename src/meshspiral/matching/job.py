@@ -86,6 +86,7 @@ class MatchJob:
             smooth=self.config.smooth,
             refine=self.config.refine,
             unflip=self.config.unflip,
+            ensemble=self.config.ensemble,
             scale=self.config.scale,
             height=self.config.height,
         )

@@ -46,6 +46,8 @@ Report = Callable[[str], None]  # is told each stage when it begins; not every m
 FACTORS = (1.0, 1.1, 1.2, 1.3, 1.45, 1.6, 1.8, 2.1, 2.5)  # tried for the size of an open surface
 SPREAD = 0.07  # over sqrt(area): how far around a label its point is averaged
 NEAR = 5.0  # mean edges of the template; labels further apart are not interpolated
+COPIES = ((0.72, 0.96), (1.0, 1.0), (1.38, 1.04))  # of an ensemble: vertices over those of a
+# training mesh, and the size over that of the mesh
 
 
 class Labels(NamedTuple):
@@ -108,6 +110,9 @@ class Matcher:
             network finds likeliest. None: do not refine.
         unflip: Whether parts that took left for right are put back, see
             `meshspiral.matching.flips`; only with a template that is its own mirror image.
+        ensemble: Whether to average the scores of the mesh and of three resampled copies, with
+            other densities and sizes (COPIES), as geometric means of probabilities. None: with a
+            refinement, if the network was trained on remeshed shapes and `resampled` is not False.
         scale: Length of one unit of the meshes in the template's unit; the bundled template is in
             metres. Radii are then those of a body of the template's size. None: they follow from
             the surface area; if a mesh has large holes, the size is sought, see `surest_size`.
@@ -132,6 +137,7 @@ class Matcher:
         smooth: bool = False,
         refine: str | None = None,
         unflip: bool = True,
+        ensemble: bool | None = None,
         scale: float | None = None,
         height: float | None = None,
     ):
@@ -149,6 +155,10 @@ class Matcher:
         if height is not None:
             self._scale = np.ptp(self.template.vertices[:, "xyz".index(self.up)]) / height
         self._refine = "zoomout" if smooth else refine
+        if ensemble is None:
+            knows_others = config.data.remesh is not None and resampled is not False
+            ensemble = knows_others and self._refine is not None
+        self._ensemble = ensemble
         self._mirror = mirror_images(self.template, self.up) if unflip else None
         self._features = Features.of(config.data)
         self._predictor = Predictor(saved, config, accelerator, calibrated=True)
@@ -160,8 +170,8 @@ class Matcher:
         Args:
             run: The run folder; only checkpoints/best.ckpt is read. None: the bundled network,
                 trained on human bodies.
-            **options: `accelerator`, `resampled`, `smooth`, `refine`, `unflip`, `scale` and
-                `height` of the class.
+            **options: `accelerator`, `resampled`, `smooth`, `refine`, `unflip`, `ensemble`, `scale`
+                and `height` of the class.
 
         Raises:
             RunError: The checkpoint is missing or damaged, has no template, or needs a plugin.
@@ -303,6 +313,8 @@ class Matcher:
             `Labels`, bool [W], and the input of the network's last layer, [W, C].
         """
         embedding = self._embed(mesh, report)
+        if self._ensemble:
+            embedding = self._with_copies(mesh, embedding, report)
         prediction = self._predictor.predict(embedding)
         template, confidence = prediction.classes.cpu().numpy(), prediction.probability
         flipped = np.zeros(len(template), dtype=bool)
@@ -339,6 +351,24 @@ class Matcher:
         batch["index"] = 0
         report("network")
         return self._predictor.embed(batch, "evaluation")
+
+    def _with_copies(self, mesh: Mesh, embedding: torch.Tensor, report: Report) -> torch.Tensor:
+        """The mean of the embeddings of a mesh and of COPIES, [W, C].
+
+        The last layer is linear, so its scores are then the mean of theirs.
+        """
+        total, count = embedding.clone(), 1
+        for density, size in COPIES:
+            vertices = round(density * self._training_size)
+            if vertices == len(mesh.vertices):
+                continue
+            report("resampling")
+            copy = resample(mesh, vertices)
+            described = self._embed(replace(copy.mesh, whole=(size * mesh.size) ** 2), report)
+            weights = torch.from_numpy(copy.weights).to(described)
+            corners = described[torch.from_numpy(copy.corners).to(described.device)]
+            total, count = total + torch.einsum("wk,wkc->wc", weights, corners), count + 1
+        return total / count
 
     def _points(self, template: np.ndarray, embedding: torch.Tensor) -> np.ndarray:
         """The points of labels, float64 [W, 3], see `soft_points`."""
