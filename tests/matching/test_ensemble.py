@@ -17,22 +17,22 @@ def test_copies_have_other_densities_and_sizes_and_are_carried_back(monkeypatch)
     """With positions in place of embeddings, the mean is where the vertices are."""
     matcher, seen = Matcher.load(), []
 
-    def positions(mesh, report):
+    def positions(mesh):
         seen.append((len(mesh.vertices), mesh.size))
         return torch.from_numpy(mesh.vertices)
 
     monkeypatch.setattr(matcher, "_embed", positions)
-    found = matcher._with_copies(BODY, positions(BODY, None), lambda stage: None)
+    found = matcher._with_copies(BODY, positions(BODY))
     assert [count for count, _ in seen] == pytest.approx([1500, 1200, 1667, 2300], rel=0.01)
     np.testing.assert_allclose([size for _, size in seen], [1, 0.96, 1, 1.04])
     off = np.linalg.norm(found.numpy() - BODY.vertices, axis=1)
     assert 0 < np.median(off) < 0.003 and off.max() < 0.03
 
-    def far(mesh, report):
+    def far(mesh):
         return torch.from_numpy(mesh.vertices) + 5
 
     monkeypatch.setattr(matcher, "_embed", far)
-    found = matcher._with_copies(BODY, torch.from_numpy(BODY.vertices), lambda stage: None)
+    found = matcher._with_copies(BODY, torch.from_numpy(BODY.vertices))
     expected = torch.from_numpy(BODY.vertices) + 15 / 4
     assert (found - expected).abs().median() < 0.003
 
@@ -40,7 +40,7 @@ def test_copies_have_other_densities_and_sizes_and_are_carried_back(monkeypatch)
 def test_a_copy_as_dense_as_the_mesh_is_left_out(monkeypatch):
     matcher, given = Matcher.load(), torch.rand(1500, 4)
     monkeypatch.setattr(module, "COPIES", ((1500 / matcher._training_size, 1.0),))
-    assert torch.equal(matcher._with_copies(BODY, given, lambda stage: None), given)
+    assert torch.equal(matcher._with_copies(BODY, given), given)
 
 
 def test_a_network_that_knows_one_tessellation_has_no_ensemble(trained):
@@ -60,6 +60,6 @@ def test_a_network_that_knows_one_tessellation_has_no_ensemble(trained):
 )
 def test_a_refinement_brings_the_ensemble_along(options, expected, monkeypatch):
     matcher, called = Matcher.load(**options), []
-    monkeypatch.setattr(matcher, "_with_copies", lambda mesh, x, report: called.append(mesh) or x)
+    monkeypatch.setattr(matcher, "_with_copies", lambda mesh, x: called.append(mesh) or x)
     matcher._predict(BODY, lambda stage: None)
     assert bool(called) == expected

@@ -41,7 +41,15 @@ from meshspiral.training.checkpoints import BUNDLED_RUN, config_of, read_checkpo
 from meshspiral.training.predictor import Predictor
 
 REFINEMENTS = (None, "crf", "zoomout")
-MESH_STAGES = ("size", "resampling", "descriptors", "neighbourhoods", "network", "refinement")
+MESH_STAGES = (
+    "size",
+    "resampling",
+    "descriptors",
+    "neighbourhoods",
+    "network",
+    "copies",
+    "refinement",
+)
 Report = Callable[[str], None]  # is told each stage when it begins; not every mesh has all
 FACTORS = (1.0, 1.1, 1.2, 1.3, 1.45, 1.6, 1.8, 2.1, 2.5)  # tried for the size of an open surface
 SPREAD = 0.07  # over sqrt(area): how far around a label its point is averaged
@@ -290,7 +298,7 @@ class Matcher:
 
     def _probability(self, mesh: Mesh) -> np.ndarray:
         """The probability of the label of every vertex, float [W]."""
-        embedding = self._embed(mesh, lambda stage: None)
+        embedding = self._embed(mesh)
         return self._predictor.predict(embedding).probability.float().cpu().numpy()
 
     def _needs_resampling(self, vertices: int) -> bool:
@@ -314,7 +322,8 @@ class Matcher:
         """
         embedding = self._embed(mesh, report)
         if self._ensemble:
-            embedding = self._with_copies(mesh, embedding, report)
+            report("copies")
+            embedding = self._with_copies(mesh, embedding)
         prediction = self._predictor.predict(embedding)
         template, confidence = prediction.classes.cpu().numpy(), prediction.probability
         flipped = np.zeros(len(template), dtype=bool)
@@ -339,7 +348,7 @@ class Matcher:
         scores = torch.addmm(bias, embedding.to(weight.dtype), weight.T)
         return torch.log_softmax(scores, 1).cpu().numpy()
 
-    def _embed(self, mesh: Mesh, report: Report) -> torch.Tensor:
+    def _embed(self, mesh: Mesh, report: Report = lambda stage: None) -> torch.Tensor:
         """The input of the network's last layer, [W, C], for each vertex of a mesh."""
         report("descriptors")
         described = [compute_task(descriptor_task(mesh, d)) for d in self._features.descriptors]
@@ -352,7 +361,7 @@ class Matcher:
         report("network")
         return self._predictor.embed(batch, "evaluation")
 
-    def _with_copies(self, mesh: Mesh, embedding: torch.Tensor, report: Report) -> torch.Tensor:
+    def _with_copies(self, mesh: Mesh, embedding: torch.Tensor) -> torch.Tensor:
         """The mean of the embeddings of a mesh and of COPIES, [W, C].
 
         The last layer is linear, so its scores are then the mean of theirs.
@@ -362,9 +371,8 @@ class Matcher:
             vertices = round(density * self._training_size)
             if vertices == len(mesh.vertices):
                 continue
-            report("resampling")
             copy = resample(mesh, vertices)
-            described = self._embed(replace(copy.mesh, whole=(size * mesh.size) ** 2), report)
+            described = self._embed(replace(copy.mesh, whole=(size * mesh.size) ** 2))
             weights = torch.from_numpy(copy.weights).to(described)
             corners = described[torch.from_numpy(copy.corners).to(described.device)]
             total, count = total + torch.einsum("wk,wkc->wc", weights, corners), count + 1
