@@ -50,6 +50,16 @@ def test_arms_are_put_back_and_the_rest_stays(parts, pose, mirror):
     np.testing.assert_array_equal(found[rest], TRUE[rest])
 
 
+def test_a_band_around_an_arm_does_not_take_the_hand_along(mirror):
+    mesh, labels = BODIES.load("s9_squat").mesh, TRUE.copy()
+    band = LEFT_ARM & (X < 0.3 * np.ptp(X))
+    assert band.sum() > 30 and (LEFT_ARM & ~band).sum() > band.sum()
+    labels[band] = mirror[TRUE[band]]
+    found = without_flips(labels, mesh, TEMPLATE, mirror)
+    np.testing.assert_array_equal(found[~band], TRUE[~band])
+    assert LEFT_ARM[found[band]].mean() > 0.95
+
+
 def test_noise_and_a_body_that_is_all_mirrored_stay(mirror):
     """Labels that jump to anywhere would still jump as mirror images."""
     mesh, rng = BODIES.load("s9_squat").mesh, np.random.default_rng(0)

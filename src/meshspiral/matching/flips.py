@@ -16,8 +16,8 @@ from scipy.spatial import cKDTree
 from meshspiral.geometry.faces import directed_edges
 from meshspiral.geometry.mesh import Mesh
 
-JUMP = 0.15  # over sqrt(area) of the template: the least distance of labels that jump
-REMAINING = 0.3  # largest share of the jumps around a piece that remains if it took left for right
+JUMP = 0.1  # over sqrt(area) of the template: the least distance of labels that jump
+REMAINING = 0.5  # largest share of the jumps around a piece that remains if it took left for right
 ROUNDS = 20
 ASYMMETRY = 0.03  # over sqrt(area): mean distance of a mirror image from the nearest vertex
 
@@ -48,7 +48,7 @@ def without_flips(labels: np.ndarray, mesh: Mesh, template: Mesh, mirror: np.nda
 
     The mesh is cut into pieces along the edges at which labels jump. A piece takes the mirror
     images if at most REMAINING of its jumps to other pieces are left then; of two that meet, the
-    one that loses more jumps does so first. The piece with the largest area stays.
+    smaller one does so first. The piece with the largest area stays.
 
     Args:
         labels: int [W], vertices of the template.
@@ -74,12 +74,13 @@ def without_flips(labels: np.ndarray, mesh: Mesh, template: Mesh, mirror: np.nda
         after = np.concatenate([jump(mirror[a], b), jump(a, mirror[b])])
         gain = jumps - np.bincount(ends.ravel(), after, minlength=count)
         better = (jumps > 0) & (gain >= (1 - REMAINING) * jumps)
-        better[np.bincount(piece, areas).argmax()] = False
+        sizes = np.bincount(piece, areas)
+        better[sizes.argmax()] = False
         if not better.any():
             break
-        # of two pieces that meet, the one that gains less waits for the next round
+        # of two pieces that meet, the larger one waits for the next round
         first, second = ends[:, better[ends].all(axis=0)]
-        better[np.where(gain[first] < gain[second], first, second)] = False
+        better[np.where(sizes[first] < sizes[second], second, first)] = False
         labels = np.where(better[piece], mirror[labels], labels)
     return labels
 
