@@ -1,6 +1,7 @@
 """How robust labels are to changes of a mesh, measured outside the test suite:
 
-    python -m tests.robustness 20 [run folder]
+    python -m tests.robustness 5
+    python -m tests.robustness 20 --rows mixed_1100 --run <run_folder>
 
 Labels that many of the 20 test bodies with the bundled network or that of a run. Prints for each
 change of the bodies, and for each option of the matcher, the share of exact matches, the mean error
@@ -11,7 +12,7 @@ at most 0.05 from the mirror image of the true vertex.
 
 from __future__ import annotations
 
-import sys
+import argparse
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -39,6 +40,7 @@ TESSELLATIONS = [  # policy, number of vertices
     ("isotropic", 7000),
     ("isotropic", 15000),
     ("mixed", 1500),
+    ("mixed", 1100),
 ]
 OPTIONS = {
     "default": {},
@@ -110,18 +112,25 @@ CHANGES: dict[str, Callable[[Shape, np.random.Generator], Shape]] = {
 
 
 def main() -> None:
-    count, run = int(sys.argv[1]), (Path(sys.argv[2]) if len(sys.argv) > 2 else None)
+    parser = argparse.ArgumentParser()
+    parser.add_argument("bodies", type=int)
+    parser.add_argument("--run", type=Path)
+    parser.add_argument("--rows", nargs="*", default=[], help="such as mixed_1100; all if none")
+    words = parser.parse_args()
     bodies = Bodies(1500)
-    names = evenly(bodies.names["test"], count)
+    names = evenly(bodies.names["test"], words.bodies)
     reference = ReferenceDistances(bodies.template, CACHE)
     originals = [bodies.load(name) for name in names]
     rng = np.random.default_rng(0)
     cases = {title: [change(body, rng) for body in originals] for title, change in CHANGES.items()}
+    cases = {} if words.rows else cases
     for policy, vertices in TESSELLATIONS:
+        if words.rows and f"{policy}_{vertices}" not in words.rows:
+            continue
         remeshed = Remeshed(bodies, CACHE, None, policy, vertices)
         remeshed.prepare(names)
         cases[f"{policy}, {vertices:,} vertices"] = [remeshed.load(name) for name in names]
-    matchers = [Matcher.load(run, **options) for options in OPTIONS.values()]
+    matchers = [Matcher.load(words.run, **options) for options in OPTIONS.values()]
     mirror = mirror_images(bodies.template, bodies.up)
     print(f"{'':44}" + "".join(f"{name:>44}" for name in OPTIONS))
     for title, shapes in cases.items():
