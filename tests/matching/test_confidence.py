@@ -123,6 +123,19 @@ def test_confidences_are_those_of_the_formula():
     np.testing.assert_allclose(near_confidence(source, labels, NEAR), expected, atol=1e-6)
 
 
+def test_of_a_vertex_whose_side_is_known_the_other_side_has_no_probability():
+    rng = np.random.default_rng(0)
+    p = rng.dirichlet(np.ones(SIZE), 3)
+    sides = rng.integers(-1, 2, SIZE).astype(np.int8)
+    plain = distributions(p, np.arange(3))
+    known = plain._replace(side=np.array([1, 0, -1]), sides=sides)
+    found = known.rows(np.array([2, 0, 1]))
+    for row, (vertex, side) in enumerate([(2, -1), (0, 1)]):
+        kept = np.where(sides != -side, p[vertex], 0)
+        np.testing.assert_allclose(found[row], kept / kept.sum(), atol=1e-6)
+    np.testing.assert_allclose(found[2], p[1], atol=1e-6)
+
+
 @pytest.mark.parametrize("smooth", [False, True])
 def test_matches_of_bodies_with_high_confidence_are_right(smooth):
     bodies = Bodies(1500)

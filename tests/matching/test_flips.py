@@ -7,7 +7,7 @@ import pytest
 
 from meshspiral.data.datasets.bodies import Bodies
 from meshspiral.data.scans import scan
-from meshspiral.matching.flips import mirror_images, without_flips
+from meshspiral.matching.flips import mirror_images, sides_of, without_flips
 from meshspiral.matching.job import FileMatch, LabelledScan
 from meshspiral.matching.matcher import Matcher
 from meshspiral.matching.writing import remark_lines
@@ -30,6 +30,14 @@ def test_mirror_images_change_sides_and_nothing_else(mirror):
     image = TEMPLATE.vertices[mirror] * [-1, 1, 1]
     apart = np.linalg.norm(image - TEMPLATE.vertices, axis=1)
     assert np.median(apart) < 0.5 * TEMPLATE.mean_edge
+
+
+def test_the_sides_of_the_template(mirror):
+    sides = sides_of(TEMPLATE, mirror)
+    assert abs(sides[LEFT_ARM].mean()) == 1 and sides[LEFT_ARM][0] == -sides[RIGHT_ARM][0]
+    middle = np.abs(X - (X.min() + X.max()) / 2) < 0.3 * TEMPLATE.mean_edge
+    assert middle.sum() > 20 and (sides[middle] == 0).mean() > 0.9
+    assert (sides == 0).mean() < 0.15
 
 
 def test_a_template_without_a_mirror_image_has_none():

@@ -34,19 +34,29 @@ class Distributions(NamedTuple):
         weight: float [K, C], of the last layer.
         bias: float [K].
         row_of: int64 [V], the row of `embedding` of every given vertex; -1 for none.
+        side: int8 [W], the side of the template where a vertex is known to belong: 1, -1, or 0 for
+            not known. The probabilities are those under that condition.
+        sides: int8 [K], the side of each template vertex, 0 on the mirror; required with `side`.
     """
 
     embedding: Tensor
     weight: Tensor
     bias: Tensor
     row_of: np.ndarray
+    side: np.ndarray | None = None
+    sides: np.ndarray | None = None
 
     @torch.inference_mode()
     def rows(self, rows: np.ndarray) -> np.ndarray:
         """Probabilities of the template's vertices, float [R, K], for some rows [R]."""
         x = self.embedding[torch.from_numpy(rows).to(self.embedding.device)]
         scores = torch.addmm(self.bias, x.to(self.weight.dtype), self.weight.T)
-        return torch.softmax(scores, dim=1).cpu().numpy()
+        probability = torch.softmax(scores, dim=1).cpu().numpy()
+        if self.side is not None:
+            other = self.side[rows, None] * self.sides < 0
+            probability = np.where(other, 0, probability)
+            probability /= np.maximum(probability.sum(axis=1, keepdims=True), TINY)
+        return probability
 
 
 def near_vertices(template: Mesh, radius: float = RADIUS) -> csr_array:

@@ -43,6 +43,18 @@ def mirror_images(template: Mesh, up: str) -> np.ndarray | None:
     return nearest if asymmetry < ASYMMETRY else None
 
 
+def sides_of(template: Mesh, mirror: np.ndarray) -> np.ndarray:
+    """On which side of the mirror each vertex is, int8 [K]: 1, -1, or 0 near it.
+
+    Args:
+        template: K vertices.
+        mirror: int [K], from `mirror_images`.
+    """
+    across = template.vertices - template.vertices[mirror]
+    across = across[:, np.abs(across).mean(axis=0).argmax()]
+    return (np.sign(across) * (np.abs(across) > template.mean_edge)).astype(np.int8)
+
+
 def without_flips(labels: np.ndarray, mesh: Mesh, template: Mesh, mirror: np.ndarray) -> np.ndarray:
     """Replace the labels of pieces that took left for right by their mirror images.
 

@@ -35,7 +35,7 @@ from meshspiral.matching.confidence import (
     near_vertices,
     soft_points,
 )
-from meshspiral.matching.flips import mirror_images, without_flips
+from meshspiral.matching.flips import mirror_images, sides_of, without_flips
 from meshspiral.matching.mean_field import MeanField, likeliest_near
 from meshspiral.training.checkpoints import BUNDLED_RUN, config_of, read_checkpoint, template_of
 from meshspiral.training.predictor import Predictor
@@ -219,22 +219,22 @@ class Matcher:
         if self._needs_resampling(len(mesh.vertices)):
             report("resampling")
             coarse = resample(mesh, self._training_size)
-            template, confidence, flipped, embedding = self._predict(coarse.mesh, report)
-            points = self._points(template, embedding)
+            template, confidence, flipped, found = self._predict(coarse.mesh, report)
+            points = self._points(template, found)
             nearest = coarse.corners[np.arange(len(mesh.vertices)), coarse.weights.argmax(axis=1)]
             points = self._interpolate(points[coarse.corners], coarse.weights, points[nearest])
             template = self._nearest_vertices(points)
             confidence, flipped = confidence[nearest], flipped[nearest]
         else:
-            template, confidence, flipped, embedding = self._predict(mesh, report)
-            points, nearest = self._points(template, embedding), np.arange(len(template))
+            template, confidence, flipped, found = self._predict(mesh, report)
+            points, nearest = self._points(template, found), np.arange(len(template))
         missing = scan.vertex_of < 0
         template, confidence, points, flipped, row_of = (
             values[scan.vertex_of] for values in (template, confidence, points, flipped, nearest)
         )
         template[missing], confidence[missing], points[missing] = -1, 0.0, np.nan
         flipped[missing], row_of[missing] = False, -1
-        distributions = Distributions(embedding, *self._predictor.head, row_of)
+        distributions = found._replace(row_of=row_of)
         around = near_confidence(distributions, template, self._near_vertices)
         labels = Labels(template.astype(np.int32), points, confidence, around, flipped)
         return labels, distributions
@@ -309,7 +309,7 @@ class Matcher:
 
     def _predict(
         self, mesh: Mesh, report: Report
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, torch.Tensor]:
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, Distributions]:
         """Predict for each vertex of a mesh a template vertex and its probability.
 
         Args:
@@ -318,7 +318,7 @@ class Matcher:
 
         Returns:
             Vertices of the template, int64 [W], their probabilities, float32 [W], `flipped` of
-            `Labels`, bool [W], and the input of the network's last layer, [W, C].
+            `Labels`, bool [W], and the distributions of all W vertices.
         """
         embedding = self._embed(mesh, report)
         if self._ensemble:
@@ -338,9 +338,16 @@ class Matcher:
         if self._refine == "zoomout":
             template = zoomout(*eigenfunctions(mesh, TO), self._eigenfunctions, template)
             template = likeliest_near(self._log_probability(embedding), template, self.template)
-        if self._refine is not None or flipped.any():
+        if self._refine is not None:
             confidence = self._predictor.predict(embedding, torch.from_numpy(template)).of_label
-        return template, confidence.float().cpu().numpy(), flipped, embedding
+        confidence = confidence.float().cpu().numpy()
+        found = Distributions(embedding, *self._predictor.head, np.arange(len(template)))
+        if flipped.any():
+            side = np.where(flipped, self._sides[template], 0)
+            found = found._replace(side=side, sides=self._sides)
+            rows = np.flatnonzero(flipped)
+            confidence[rows] = found.rows(rows)[np.arange(len(rows)), template[rows]]
+        return template, confidence, flipped, found
 
     def _log_probability(self, embedding: torch.Tensor) -> np.ndarray:
         """Of each template vertex, float32 [W, K], from the input of the last layer, [W, C]."""
@@ -378,9 +385,8 @@ class Matcher:
             total, count = total + torch.einsum("wk,wkc->wc", weights, corners), count + 1
         return total / count
 
-    def _points(self, template: np.ndarray, embedding: torch.Tensor) -> np.ndarray:
+    def _points(self, template: np.ndarray, found: Distributions) -> np.ndarray:
         """The points of labels, float64 [W, 3], see `soft_points`."""
-        found = Distributions(embedding, *self._predictor.head, np.arange(len(template)))
         return soft_points(found, template, self._spread, self.template.vertices)
 
     def _interpolate(
@@ -409,6 +415,10 @@ class Matcher:
     @cached_property
     def _spread(self) -> csr_array:
         return near_vertices(self.template, SPREAD)
+
+    @cached_property
+    def _sides(self) -> np.ndarray:
+        return sides_of(self.template, self._mirror)
 
     @cached_property
     def _mean_field(self) -> MeanField:
