@@ -150,7 +150,7 @@ class MeanNet(SpiralNet, name="mean"):
 
 def test_a_network_of_a_plugin_is_measured(cli, tmp_path, monkeypatch, small_sizes):
     (tmp_path / "mean_plugin.py").write_text(PLUGIN)
-    lines = (ROOT / "conf" / "model" / "lstm.yaml").read_text().replace("lstm", "mean")
+    lines = (ROOT / "conf" / "model" / "fcs.yaml").read_text().replace("fcs", "mean")
     (tmp_path / "my_conf" / "model").mkdir(parents=True)
     (tmp_path / "my_conf" / "model" / "mean.yaml").write_text(lines)
     monkeypatch.setattr(sys, "path", sys.path[:])

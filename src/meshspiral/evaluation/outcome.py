@@ -119,9 +119,16 @@ class Outcome:
         curve = values.pop("curve").numpy()
         metrics = {name: float(value) for name, value in values.items()}
         metrics["geodesic_error_diameter"] = metrics["geodesic_error"] / self.diameter
-        if not np.array_equal(self.errors, self.label_errors):
-            metrics["geodesic_error_to_label"] = float(self.label_errors.mean(dtype=np.float64))
+        if self.error_to_label is not None:
+            metrics["geodesic_error_to_label"] = self.error_to_label
         return metrics, curve
+
+    @property
+    def error_to_label(self) -> float | None:
+        """The mean error to the label; None where the true point is that vertex itself."""
+        if np.array_equal(self.errors, self.label_errors):
+            return None
+        return float(self.label_errors.mean(dtype=np.float64))
 
     def save(self, path: Path) -> None:
         """Write the file."""

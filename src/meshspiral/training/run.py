@@ -96,8 +96,8 @@ def train(config: TrainConfig, folder: Path) -> dict[str, float]:
             data.reference.diameter,
         )
         outcome.save(folder / ERRORS)
-        pooled, _ = outcome.metrics()  # with the error to the label where that is another
-        metrics = {f"test/{name}": value for name, value in pooled.items()} | metrics
+        if (error := outcome.error_to_label) is not None:
+            metrics = {"test/geodesic_error_to_label": error} | metrics
         chosen = evenly(outcome.names, 4) if config.picture else []
         summary.write_plots(folder, module.curves, outcome, data, chosen)
         write_metrics(folder, metrics)  # the last file: now the run is finished
