@@ -51,7 +51,8 @@ def test_training_after_it_reads_no_mesh(cli, arguments, toy_overrides, tmp_path
         ("model=fcs", "unknown setting model"),
     ],
 )
-def test_a_mistake_is_one_line(cli, arguments, word, message):
+def test_a_mistake_is_one_line(cli, arguments, word, message, monkeypatch):
+    monkeypatch.setattr("meshspiral.data.pool.CONNECT", 1.0)
     code, out, err = cli(*arguments, word, program=preprocess.main)
     assert code in (1, 2) and message in (out + err) and "Traceback" not in out + err
 

@@ -20,6 +20,7 @@ from meshspiral.data.shapes import DataError
 
 POOL_START = 6.0  # seconds that starting the worker processes takes
 LARGEST_JOB = 16  # items
+CONNECT = 10.0  # seconds to wait for a scheduler's answer
 
 
 def run_all(
@@ -93,7 +94,7 @@ def on_cluster(scheduler: str | None) -> Iterator[None]:
     except ImportError as error:
         raise DataError("scheduler= needs Dask: pip install 'dask[distributed]'") from error
     try:
-        client = Client(scheduler, timeout=10)
+        client = Client(scheduler, timeout=CONNECT)
     except (OSError, ValueError) as error:
         raise DataError(f"scheduler={scheduler}: no Dask scheduler answers there") from error
     with client, parallel_config("dask", client=client):
