@@ -111,3 +111,13 @@ def icosphere(subdivisions=3):
 
     sphere = trimesh.creation.icosphere(subdivisions=subdivisions)
     return Mesh(sphere.vertices, sphere.faces)
+
+
+def two_boxes(gap: float) -> Mesh:
+    """Two boxes of width 0.3 side by side along x, with a gap between them; the size is 1.2."""
+    boxes = [
+        trimesh.creation.box((0.3, 0.5, 0.3)).apply_translation([side * (0.15 + gap / 2), 0, 0])
+        for side in (-1, 1)
+    ]
+    both = trimesh.util.concatenate(boxes).subdivide_to_size(0.08)
+    return Mesh(both.vertices, both.faces)

@@ -122,8 +122,8 @@ def main() -> None:
     reference = ReferenceDistances(bodies.template, CACHE)
     originals = [bodies.load(name) for name in names]
     rng = np.random.default_rng(0)
-    cases = {title: [change(body, rng) for body in originals] for title, change in CHANGES.items()}
-    cases = {} if words.rows else cases
+    changes = {} if words.rows else CHANGES
+    cases = {title: [change(body, rng) for body in originals] for title, change in changes.items()}
     for policy, vertices in TESSELLATIONS:
         if words.rows and f"{policy}_{vertices}" not in words.rows:
             continue

@@ -29,7 +29,7 @@ from meshspiral.geometry.remesh import closest_points
 from tests import helpers
 from tests.conftest import toy_shapes
 from tests.helpers import run
-from tests.meshes import lattice
+from tests.meshes import lattice, two_boxes
 
 
 class Toys(ShapeSet):
@@ -249,19 +249,10 @@ class Hands(Toys):
         super().__init__()
         self.gaps = {"a": 0.03, "b": 0.3}
         self.names = {"train": ["a", "b"], "val": [], "test": []}
-        self.template = self.mesh("a")
-
-    def mesh(self, name: str) -> Mesh:
-        x = 0.15 + self.gaps[name] / 2
-        boxes = [
-            trimesh.creation.box((0.3, 0.5, 0.3)).apply_translation([side * x, 0, 0])
-            for side in (-1, 1)
-        ]
-        both = trimesh.util.concatenate(boxes).subdivide_to_size(0.08)
-        return Mesh(both.vertices, both.faces, name)
+        self.template = two_boxes(self.gaps["a"])
 
     def load(self, name: str) -> Shape:
-        return registered_shape(self.mesh(name), self.template)
+        return registered_shape(two_boxes(self.gaps[name]), self.template)
 
 
 def test_what_is_fused_in_one_shape_is_torn_in_another(tmp_path, monkeypatch):

@@ -21,7 +21,7 @@ from meshspiral.geometry.remesh import (
     closest_points,
     remesh,
 )
-from tests.meshes import bumpy_sphere, lattice
+from tests.meshes import bumpy_sphere, lattice, two_boxes
 
 SINGLE = list(POLICIES)
 
@@ -121,14 +121,9 @@ def test_tori_and_open_surfaces_get_the_size_wanted(policy):
 
 @pytest.mark.parametrize("gap, joined", [(0.03, True), (0.08, False)])
 def test_fused_fills_a_narrow_gap_and_leaves_a_wide_one(gap, joined, monkeypatch):
-    """Between two boxes of size about 1.2; of those that stay apart only one is left."""
+    """Of boxes that stay apart only one is left."""
     monkeypatch.setattr("meshspiral.geometry.remesh.FUSED", (0.02, 0.02))
-    boxes = [
-        trimesh.creation.box((0.3, 0.5, 0.3)).apply_translation([side * (0.15 + gap / 2), 0, 0])
-        for side in (-1, 1)
-    ]
-    both = trimesh.util.concatenate(boxes).subdivide_to_size(0.08)
-    made = solid(remesh(Mesh(both.vertices, both.faces), 800, "fused", seed=0).mesh)
+    made = solid(remesh(two_boxes(gap), 800, "fused", seed=0).mesh)
     assert made.is_watertight and made.euler_number == 2
     assert made.extents[0] == pytest.approx(0.6 + gap if joined else 0.3, abs=0.01)
 

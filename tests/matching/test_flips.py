@@ -101,9 +101,7 @@ def test_a_matcher_puts_parts_back_and_says_so(mirror, monkeypatch):
     confused(matcher, mirror, monkeypatch)
     labels, distributions = matcher.predict(opened)
     assert (labels.flipped == LEFT_ARM).mean() > 0.98
-    assert (
-        labels.template == plain.template
-    ).mean() > 0.98  # by what the network says of that side
+    assert (labels.template == plain.template).mean() > 0.98
     match = FileMatch("a.ply", LabelledScan(opened, labels, distributions), None, None, None)
     [line] = [line for line in remark_lines(match) if "put back" in line]
     assert line.startswith(f"  left and right put back at {labels.flipped.sum()} vertices (")

@@ -118,7 +118,8 @@ def test_the_bar_shows_the_stages(cli, trained, files, monkeypatch):
     reading = ["source: reading", "target: reading"]
     assert [name for name in names if name] == [*reading, *expected, "source: writing"]
     counts = [int(re.search(r"(\d+)/17", line)[1]) for line in shown]
-    assert counts == sorted(counts) and counts[0] == 0 and counts[-1] == 16
+    # none is sized, resampled or copied
+    assert list(dict.fromkeys(counts)) == [0, 1, 4, 5, 6, 8, 11, 12, 13, 15, 16]
     assert max(map(len, shown)) <= 80
 
 

@@ -175,21 +175,23 @@ def test_spiral_lstm_is_the_last_output_of_an_lstm_before_padding(metric, padded
         torch.testing.assert_close(a, b, rtol=0, atol=1e-11)
 
 
+def output_and_gradients(layer: SpiralLSTM, *inputs) -> list[torch.Tensor]:
+    """The output of a layer, and the gradients of its parameters for the sum of squares."""
+    layer.zero_grad()
+    out = layer(*inputs)
+    out.square().sum().backward()
+    return [out.detach(), *(p.grad.clone() for p in layer.parameters())]
+
+
 @pytest.mark.parametrize("rows", [1, 5, 13, 512])
 def test_the_chunk_size_does_not_change_an_lstm(rows, monkeypatch):
     layer = SpiralLSTM(5, 7, metric=True).double()
     features, spirals = torch.randn(13, 5, dtype=torch.float64), sequences(13, 6, padded=True)
     extra = torch.randn(13, 6, 2, dtype=torch.float64)
 
-    def run():
-        layer.zero_grad()
-        out = layer(features, spirals, extra)
-        out.square().sum().backward()
-        return [out.detach(), *(p.grad.clone() for p in layer.parameters())]
-
-    whole = run()
+    whole = output_and_gradients(layer, features, spirals, extra)
     monkeypatch.setattr(recurrence, "ROWS", rows)
-    for a, b in zip(run(), whole, strict=True):
+    for a, b in zip(output_and_gradients(layer, features, spirals, extra), whole, strict=True):
         torch.testing.assert_close(a, b, rtol=0, atol=1e-12)
     with torch.no_grad():  # uses buffers for two steps only
         torch.testing.assert_close(layer(features, spirals, extra), whole[0], rtol=0, atol=1e-12)
@@ -209,17 +211,11 @@ def test_an_lstm_that_computes_its_steps_again_has_the_same_gradient(metric, mon
 
     monkeypatch.setattr(recurrence, "_forward_steps", noted)
 
-    def run():
-        layer.zero_grad()
-        out = layer(features, spirals, extra)
-        out.square().sum().backward()
-        return [out.detach(), *(p.grad.clone() for p in layer.parameters())]
-
-    kept = run()
+    kept = output_and_gradients(layer, features, spirals, extra)
     assert chunks == [(19, True)]
     chunks.clear()
     layer.recompute = True
-    for a, b in zip(run(), kept, strict=True):
+    for a, b in zip(output_and_gradients(layer, features, spirals, extra), kept, strict=True):
         torch.testing.assert_close(a, b, rtol=0, atol=1e-12)
     parts = [3, 3, 3, 3, 3, 3, 1]  # an eighth, rounded up; each without its steps, later with them
     assert chunks == [*((n, False) for n in parts), *((n, True) for n in reversed(parts))]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Iterator
 from functools import partial
 from importlib.metadata import version
 
@@ -47,9 +48,8 @@ class ReferenceDistances:
 
     def prepare(self) -> None:
         """Compute and cache all distances."""
-        blocks = range(-(-len(self.template.vertices) // BLOCK))
-        for block in tqdm(blocks, desc="Geodesic distances", unit="block", leave=False, delay=1.0):
-            self._block(block)
+        for _ in self._all_blocks("Geodesic distances"):
+            pass
 
     def __call__(self, sources: np.ndarray, targets: np.ndarray) -> np.ndarray:
         """Distances between pairs of vertices.
@@ -88,9 +88,8 @@ class ReferenceDistances:
         """
         count, areas = len(self.template.vertices), self.template.vertex_areas
         rows = []
-        blocks = range(-(-count // BLOCK))
-        for block in tqdm(blocks, desc="Soft labels", unit="block", leave=False, delay=1.0):
-            for v, distances in enumerate(self._block(block), start=block * BLOCK):
+        for block, found in self._all_blocks("Soft labels"):
+            for v, distances in enumerate(found, start=block * BLOCK):
                 near = np.flatnonzero(distances < 3 * width)
                 near = np.union1d(near, [v])
                 weights = np.exp(-0.5 * (distances[near] / width) ** 2) * areas[near]
@@ -102,6 +101,12 @@ class ReferenceDistances:
         for v, (near, probabilities) in enumerate(rows):
             vertices[v, : len(near)], weights[v, : len(near)] = near, probabilities
         return vertices, weights
+
+    def _all_blocks(self, title: str) -> Iterator[tuple[int, np.ndarray]]:
+        """All blocks with their numbers, with a progress bar."""
+        numbers = range(-(-len(self.template.vertices) // BLOCK))
+        for block in tqdm(numbers, desc=title, unit="block", leave=False, delay=1.0):
+            yield block, self._block(block)
 
     def _block(self, block: int) -> np.ndarray:
         if block not in self._blocks:

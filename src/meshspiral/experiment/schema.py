@@ -186,7 +186,8 @@ class MatchConfig(Strict):
     )
     smooth: bool = Field(description="the same as refine=zoomout")
     unflip: bool = Field(
-        description="put parts back that took left for right, if the template has both sides alike"
+        description="put parts back that took left for right, if the template is its own mirror "
+        "image"
     )
     ensemble: bool | None = Field(
         description="average the predictions for the mesh and three resampled copies: more exact, "

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import potpourri3d
-from scipy.sparse import coo_matrix
-from scipy.sparse.csgraph import connected_components
+from trimesh.graph import connected_component_labels
 
 from meshspiral.geometry.mesh import Mesh, MeshError, used_vertices
 
@@ -95,7 +94,5 @@ def diameter(mesh: Mesh, sweeps: int = 8) -> float:
 
 def _components(mesh: Mesh) -> np.ndarray:
     """The connected component of every vertex, int32 [V]."""
-    start, tip = mesh.faces[:, [0, 1, 1, 2]].reshape(-1, 2).T  # two edges connect a face's corners
-    count = len(mesh.vertices)
-    graph = coo_matrix((np.ones(len(start), dtype=bool), (start, tip)), shape=(count, count))
-    return connected_components(graph, directed=False)[1]
+    edges = mesh.faces[:, [0, 1, 1, 2]].reshape(-1, 2)  # two edges connect a face's corners
+    return connected_component_labels(edges, node_count=len(mesh.vertices))

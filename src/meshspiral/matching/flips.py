@@ -9,9 +9,8 @@ the arm are replaced by their mirror images.
 from __future__ import annotations
 
 import numpy as np
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
+from trimesh.graph import connected_component_labels
 
 from meshspiral.geometry.faces import directed_edges
 from meshspiral.geometry.mesh import Mesh
@@ -79,14 +78,14 @@ def without_flips(labels: np.ndarray, mesh: Mesh, template: Mesh, mirror: np.nda
 
     for _ in range(ROUNDS):
         cut = jump(*labels[edges])
-        count, piece = _pieces(edges[:, ~cut], len(labels))
+        piece = connected_component_labels(edges[:, ~cut].T, node_count=len(labels))
         cut &= piece[edges[0]] != piece[edges[1]]  # else another way leads around the jump
         ends, (a, b) = piece[edges[:, cut]], labels[edges[:, cut]]
-        jumps = np.bincount(ends.ravel(), minlength=count)
-        after = np.concatenate([jump(mirror[a], b), jump(a, mirror[b])])
-        gain = jumps - np.bincount(ends.ravel(), after, minlength=count)
-        better = (jumps > 0) & (gain >= (1 - REMAINING) * jumps)
         sizes = np.bincount(piece, areas)
+        jumps = np.bincount(ends.ravel(), minlength=len(sizes))
+        after = np.concatenate([jump(mirror[a], b), jump(a, mirror[b])])
+        gain = jumps - np.bincount(ends.ravel(), after, minlength=len(sizes))
+        better = (jumps > 0) & (gain >= (1 - REMAINING) * jumps)
         better[sizes.argmax()] = False
         if not better.any():
             break
@@ -95,9 +94,3 @@ def without_flips(labels: np.ndarray, mesh: Mesh, template: Mesh, mirror: np.nda
         better[np.where(sizes[first] < sizes[second], second, first)] = False
         labels = np.where(better[piece], mirror[labels], labels)
     return labels
-
-
-def _pieces(edges: np.ndarray, vertices: int) -> tuple[int, np.ndarray]:
-    """The number of pieces that edges [2, E] connect, and the piece of each vertex, int [W]."""
-    graph = coo_array((np.ones(edges.shape[1]), tuple(edges)), shape=(vertices, vertices))
-    return connected_components(graph, directed=False)

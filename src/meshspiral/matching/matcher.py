@@ -54,8 +54,8 @@ Report = Callable[[str], None]  # is told each stage when it begins; not every m
 FACTORS = (1.0, 1.1, 1.2, 1.3, 1.45, 1.6, 1.8, 2.1, 2.5)  # tried for the size of an open surface
 SPREAD = 0.07  # over sqrt(area): how far around a label its point is averaged
 NEAR = 5.0  # mean edges of the template; labels further apart are not interpolated
-COPIES = ((0.72, 0.96), (1.0, 1.0), (1.38, 1.04))  # of an ensemble: vertices over those of a
-# training mesh, and the size over that of the mesh
+# of an ensemble: vertices over those of a training mesh, and size over that of the mesh
+COPIES = ((0.72, 0.96), (1.0, 1.0), (1.38, 1.04))
 
 
 class Labels(NamedTuple):
@@ -329,15 +329,16 @@ class Matcher:
         flipped = np.zeros(len(template), dtype=bool)
         if self._refine is not None:
             report("refinement")
-            template = self._mean_field(self._log_probability(embedding), mesh)
+            scores = self._log_probability(embedding)
+            template = self._mean_field(scores, mesh)
         if self._mirror is not None:
             mirrored = without_flips(template, mesh, self.template, self._mirror)
             flipped = mirrored != template
-            scores = self._log_probability(embedding[torch.from_numpy(flipped)])
-            template[flipped] = likeliest_near(scores, mirrored[flipped], self.template)
+            of_flipped = self._log_probability(embedding[torch.from_numpy(flipped)])
+            template[flipped] = likeliest_near(of_flipped, mirrored[flipped], self.template)
         if self._refine == "zoomout":
             template = zoomout(*eigenfunctions(mesh, TO), self._eigenfunctions, template)
-            template = likeliest_near(self._log_probability(embedding), template, self.template)
+            template = likeliest_near(scores, template, self.template)
         if self._refine is not None:
             confidence = self._predictor.predict(embedding, torch.from_numpy(template)).of_label
         confidence = confidence.float().cpu().numpy()

@@ -97,7 +97,7 @@ def train(config: TrainConfig, folder: Path) -> dict[str, float]:
         )
         outcome.save(folder / ERRORS)
         if (error := outcome.error_to_label) is not None:
-            metrics = {"test/geodesic_error_to_label": error} | metrics
+            metrics["test/geodesic_error_to_label"] = error
         chosen = evenly(outcome.names, 4) if config.picture else []
         summary.write_plots(folder, module.curves, outcome, data, chosen)
         write_metrics(folder, metrics)  # the last file: now the run is finished

@@ -15,8 +15,7 @@ from matplotlib.cm import ScalarMappable
 from matplotlib.collections import PolyCollection
 from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
+from trimesh.graph import connected_component_labels
 
 from meshspiral.geometry.mesh import Mesh
 from meshspiral.viz.colors import ERROR_COLORS, MOST_ERROR
@@ -231,8 +230,7 @@ def neighbourhood_figure(
 def _connected(faces: np.ndarray, v: int, count: int) -> np.ndarray:
     """The faces of the connected component of vertex v, int [F, 3]."""
     edges = faces[:, [0, 1, 1, 2]].reshape(-1, 2)
-    graph = coo_array((np.ones(len(edges)), edges.T), shape=(count, count))
-    component = connected_components(graph, directed=False)[1]
+    component = connected_component_labels(edges, node_count=count)
     return faces[component[faces[:, 0]] == component[v]]
 
 
