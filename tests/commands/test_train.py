@@ -449,6 +449,16 @@ def test_a_run_older_than_a_setting_resumes(tmp_path, toy_overrides):
     assert resumed_config(composed(resume), resume).model.metric_layers == "all"
 
 
+def test_a_run_resumes_whose_disks_had_a_setting_of_another_name(tmp_path, toy_overrides):
+    config = composed([*toy_overrides, "model=monet", "neighbourhood.max_vertices=20"])
+    claim(tmp_path, config)
+    old = OmegaConf.load(tmp_path / CONFIG)
+    old.neighbourhood.most = old.neighbourhood.pop("max_vertices")
+    OmegaConf.save(old, tmp_path / CONFIG)
+    resume = [f"resume={tmp_path}"]
+    assert resumed_config(composed(resume), resume) == config
+
+
 @pytest.mark.parametrize(
     "overrides, old_model",
     [

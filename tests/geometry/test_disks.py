@@ -69,8 +69,8 @@ def test_isolated_vertices_are_alone_and_pieces_apart():
 
 
 @pytest.mark.parametrize(
-    "radius, most, word", [(0, 5, "radius"), (np.inf, 5, "radius"), (1, 0, "most")]
+    "radius, max_vertices, word", [(0, 5, "radius"), (np.inf, 5, "radius"), (1, 0, "max_vertices")]
 )
-def test_wrong_arguments_are_refused(radius, most, word):
+def test_wrong_arguments_are_refused(radius, max_vertices, word):
     with pytest.raises(ValueError, match=word):
-        geodesic_disks(bumpy_sphere(), radius, most)
+        geodesic_disks(bumpy_sphere(), radius, max_vertices)

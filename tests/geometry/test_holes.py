@@ -76,7 +76,7 @@ def test_a_hole_longer_than_the_circle_stays_open():
 
 def test_the_radius_relates_to_the_complete_surface():
     torn = without(SPHERE, [7])
-    tiny = Mesh(torn.vertices, torn.faces, "a", whole=1e-6 * torn.area)
+    tiny = Mesh(torn.vertices, torn.faces, "a", complete_area=1e-6 * torn.area)
     assert close_holes(tiny) is tiny
 
 

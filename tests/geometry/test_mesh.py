@@ -99,6 +99,6 @@ def test_vertices_in_use_and_faces_as_indices_of_them():
 def test_the_size_is_that_of_the_complete_surface():
     mesh = Mesh(np.eye(3), [[0, 1, 2]])
     assert mesh.size == pytest.approx(np.sqrt(np.sqrt(3) / 2))
-    part = Mesh(np.eye(3), [[0, 1, 2]], "a", whole=4.0)
+    part = Mesh(np.eye(3), [[0, 1, 2]], "a", complete_area=4.0)
     assert part.size == 2.0 and part.renumbered(np.array([2, 0, 1])).size == 2.0
     assert part.with_faces(np.array([[0, 2, 1]])).size == 2.0

@@ -132,7 +132,7 @@ def size(mesh: Mesh) -> float:
 def sampled(values: np.ndarray, table: PatchTable) -> np.ndarray:
     """Values [V, N] at the samples, [V, rings, rays, N]; NaN at missing samples."""
     at = np.einsum("...k,...kn->...n", table.weights.astype(float), values[table.indices])
-    return np.where(table.whole[..., None], at, np.nan)
+    return np.where(table.exists[..., None], at, np.nan)
 
 
 def sample_points(mesh: Mesh, table: PatchTable) -> np.ndarray:
@@ -150,13 +150,13 @@ def assert_sound(mesh: Mesh, table: PatchTable) -> None:
     indices, weights = table
     assert indices.min(initial=0) >= 0 and indices.max(initial=0) < len(mesh.vertices)
     assert np.isfinite(weights).all() and weights.min(initial=0) >= 0
-    whole = (weights != 0).any(-1)
-    np.testing.assert_array_equal(table.whole, whole)
-    np.testing.assert_allclose(weights[whole].sum(-1), 1, rtol=0, atol=1e-5)
-    assert (indices[~whole] == 0).all()
-    assert not (whole[:, 1:] & ~whole[:, :-1]).any()  # a ray that left does not return
+    exists = (weights != 0).any(-1)
+    np.testing.assert_array_equal(table.exists, exists)
+    np.testing.assert_allclose(weights[exists].sum(-1), 1, rtol=0, atol=1e-5)
+    assert (indices[~exists] == 0).all()
+    assert not (exists[:, 1:] & ~exists[:, :-1]).any()  # a ray that left does not return
     number = len(mesh.vertices) ** np.arange(3)  # unique for each set of three vertices
-    assert np.isin(np.sort(indices[whole], 1) @ number, np.sort(mesh.faces, 1) @ number).all()
+    assert np.isin(np.sort(indices[exists], 1) @ number, np.sort(mesh.faces, 1) @ number).all()
 
 
 # ------------------------------------------------------------------------------------- the plane
@@ -167,7 +167,7 @@ def flat_grid_angles(mesh: Mesh, table: PatchTable, radius: float, centers) -> n
 
     Checks that all samples exist and form polar grids, counter-clockwise as seen from +z.
     """
-    assert table.whole[centers].all()
+    assert table.exists[centers].all()
     step = sample_points(mesh, table)[centers] - mesh.vertices[centers, None, None]
     distance, angle = np.hypot(step[..., 0], step[..., 1]), np.arctan2(step[..., 1], step[..., 0])
     assert np.abs(distance / (radius * DISTANCES) - 1).max() < 1e-4
@@ -204,13 +204,13 @@ def test_in_a_square_a_ray_ends_at_the_side_that_it_meets():
     mesh = scattered_square(100, 2)
     radius = 0.731
     table = geodesic_patches(mesh, radius)
-    whole, points = table.whole, sample_points(mesh, table)
+    exists, points = table.exists, sample_points(mesh, table)
     ends = 0
-    for v, ray in zip(*whole[:, 0].nonzero(), strict=True):
+    for v, ray in zip(*exists[:, 0].nonzero(), strict=True):
         step = points[v, 0, ray] - mesh.vertices[v]
         grid = mesh.vertices[v] + step / np.linalg.norm(step) * radius * DISTANCES
         inside = ((grid[:, :2] > 0) & (grid[:, :2] < 1)).all(1)
-        assert inside.tolist() == whole[v, :, ray].tolist()
+        assert inside.tolist() == exists[v, :, ray].tolist()
         ends += 0 < inside.sum() < 5
     assert ends > 500
 
@@ -219,10 +219,10 @@ def test_at_a_side_half_of_the_rays_have_samples_and_at_a_corner_a_quarter():
     mesh = scattered_square(100, 2)
     radius = 1e-3
     table = geodesic_patches(mesh, radius)
-    whole, points = table.whole, sample_points(mesh, table)
+    exists, points = table.exists, sample_points(mesh, table)
     for v in range(4 + 40):
         rays, quarter = (4, v) if v < 4 else (8, (v - 4) // 10)
-        assert whole[v, :, :rays].all() and not whole[v, :, rays:].any()
+        assert exists[v, :, :rays].all() and not exists[v, :, rays:].any()
         # from the last edge clockwise: along the lower side, up the right side, ...
         angle = quarter * TURN / 4 + TURN / 32 + ANGLES[:rays]
         ray = np.stack([np.cos(angle), np.sin(angle), 0 * angle], 1)
@@ -240,7 +240,7 @@ def test_folding_a_flat_mesh_along_its_edges_changes_nothing():
     one, other = geodesic_patches(flat, 3.3), geodesic_patches(folded, 3.3)
     np.testing.assert_array_equal(one.indices, other.indices)
     np.testing.assert_allclose(one.weights, other.weights, rtol=0, atol=1e-5)
-    assert 0.1 < one.whole.mean() < 0.9
+    assert 0.1 < one.exists.mean() < 0.9
 
 
 # ------------------------------------------------------------------------------ curved surfaces
@@ -410,7 +410,7 @@ def test_a_walk_in_space_reaches_the_same_points(mesh, radius, rings, rays):
 @pytest.mark.parametrize("radius", [0.02, 0.2, 1.0])
 def test_on_a_closed_mesh_no_sample_is_missing(mesh, radius):
     table = geodesic_patches(mesh, radius * size(mesh))
-    assert table.whole.all()
+    assert table.exists.all()
     assert_sound(mesh, table)
 
 
@@ -418,7 +418,7 @@ def test_on_a_closed_mesh_no_sample_is_missing(mesh, radius):
 @pytest.mark.parametrize("radius", [0.02, 0.2, 1.0])
 def test_on_an_open_mesh_some_samples_are_missing(mesh, radius):
     table = geodesic_patches(mesh, radius * size(mesh))
-    assert 0 < table.whole.mean() < 1
+    assert 0 < table.exists.mean() < 1
     assert_sound(mesh, table)
 
 
@@ -434,18 +434,18 @@ def test_consecutive_samples_are_no_farther_apart_than_the_rings(mesh):
 
 def test_every_vertex_of_a_triangle_has_the_rays_inside_its_corner():
     mesh = single_triangle()
-    whole = geodesic_patches(mesh, 0.01).whole
+    exists = geodesic_patches(mesh, 0.01).exists
     for v in range(3):
         b, c = mesh.vertices[[v - 2, v - 1]] - mesh.vertices[v]
         corner = np.arctan2(np.linalg.norm(np.cross(b, c)), b @ c)
         count = np.sum(corner > ANGLES + TURN / 32)
-        assert whole[v, :, :count].all() and not whole[v, :, count:].any()
+        assert exists[v, :, :count].all() and not exists[v, :, count:].any()
 
 
 def rays_by_fan(mesh: Mesh, v: int, fans: list) -> tuple[list[int], list[float]]:
     """The number of rays of v that start in each fan (a set of vertices), and the fans' angles."""
     table = geodesic_patches(mesh, 1e-3)
-    used = [set(row) - {v} for row in table.indices[v, 0][table.whole[v, 0]].tolist()]
+    used = [set(row) - {v} for row in table.indices[v, 0][table.exists[v, 0]].tolist()]
     assert all(sum(row <= fan for fan in fans) == 1 for row in used)
     angles = []
     for fan in fans:
@@ -500,7 +500,7 @@ def test_the_samples_of_a_degenerate_mesh_are_sound(mesh, radius):
     table = geodesic_patches(mesh, radius * max(size(mesh), 1.0))
     assert_sound(mesh, table)
     isolated = np.setdiff1d(np.arange(len(mesh.vertices)), mesh.faces)
-    assert not table.whole[isolated].any()
+    assert not table.exists[isolated].any()
 
 
 @pytest.mark.parametrize("name", [name for name in CLOSED | OPEN if name != "body"])
@@ -508,9 +508,9 @@ def test_a_radius_of_a_hundred_mesh_sizes_is_accepted(name):
     mesh = (CLOSED | OPEN)[name]
     table = geodesic_patches(mesh, 100 * size(mesh), rings=200, rays=5)
     assert_sound(mesh, table)
-    assert table.whole.any()
+    assert table.exists.any()
     if name in CLOSED:
-        assert table.whole.all()
+        assert table.exists.all()
 
 
 REFINED = {
@@ -541,7 +541,7 @@ def test_coincident_neighbours_all_have_samples_at_the_right_distances(splits):
     for begin, end in splits:  # the last one has a face whose corners all coincide
         mesh = split_vertex(mesh, v, begin, end)
     table = geodesic_patches(mesh, 0.5)
-    assert table.whole.all()
+    assert table.exists.all()
     coincident = (mesh.vertices == mesh.vertices[v]).all(1)
     assert coincident.sum() == 1 + len(splits)
     points = sample_points(mesh, table)[coincident]
@@ -604,7 +604,7 @@ def test_renumbering_vertices_alone_renumbers_the_table(mesh):
     order = np.random.default_rng(3).permutation(len(mesh.vertices))
     one, other = geodesic_patches(mesh, 0.7), geodesic_patches(mesh.renumbered(order), 0.7)
     np.testing.assert_array_equal(other.weights, one.weights[order])
-    indices = np.where(other.whole[..., None], order[other.indices], 0)
+    indices = np.where(other.exists[..., None], order[other.indices], 0)
     np.testing.assert_array_equal(indices, one.indices[order])
 
 

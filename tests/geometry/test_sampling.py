@@ -119,7 +119,7 @@ def test_bow_ties_holes_and_isolated_vertices_give_whole_sequences(mesh):
     axes = local_frames(mesh.vertices, 1.5)[:, 0]
     start = np.nan_to_num(surface_directions(mesh, axes))
     table = sampled_places(mesh, 0.5, 2, 6, start)
-    assert table.whole.all() and (nearest_corners(table) < len(mesh.vertices)).all()
+    assert table.exists.all() and (nearest_corners(table) < len(mesh.vertices)).all()
     np.testing.assert_allclose(table.weights.sum(axis=2), 1, atol=1e-5)
 
 
@@ -130,7 +130,7 @@ def test_degenerate_faces_give_whole_sequences():
     flat = Mesh(vertices, mesh.faces)
     start = np.nan_to_num(surface_directions(flat, local_frames(vertices, 1.0)[:, 0]))
     table = sampled_places(flat, 0.5, 2, 6, start)
-    assert table.whole.all() and np.isfinite(table.weights).all()
+    assert table.exists.all() and np.isfinite(table.weights).all()
 
 
 def test_renumbering_renumbers_the_places():

@@ -94,7 +94,7 @@ def test_the_stages_of_a_match_are_reported(trained, files):
     job = MatchJob(MatchConfig(**settings), render=False)
     stages = []
     match_file(job, settings["source"], files / "out", lambda *stage: stages.append(stage))
-    labelling = ["resampling", "descriptors", "neighbourhoods", "network", "copies", "refinement"]
+    labelling = ["resampling", "descriptors", "neighbourhoods", "network", "ensemble", "refinement"]
     assert stages == [
         ("source", "reading"),
         ("target", "reading"),

@@ -14,7 +14,7 @@ from tests.meshes import bumpy_sphere
 
 def test_disks_are_over_their_radius_and_turned_to_the_frame():
     mesh = bumpy_sphere()
-    disk = Disk(Disk.Settings(name="disk", radius=0.3, most=30, support=0.5))
+    disk = Disk(Disk.Settings(name="disk", radius=0.3, max_vertices=30, support=0.5))
     assert disk.frame == Frame(0.5, by_area=True)
     frames = compute_task(frame_task(mesh, disk.frame))["frames"]
     arrays = disk.compute(mesh, frames)

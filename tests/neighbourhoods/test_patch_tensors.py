@@ -63,7 +63,7 @@ def test_a_sample_that_left_the_surface_has_no_entries():
     mesh = lattice(4, 5)
     arrays = patch().compute(mesh)
     turn = first_directions(mesh)
-    whole = geodesic_patches(mesh, 0.1 * diameter(mesh), 3, 8, turn).whole.transpose(0, 2, 1)
+    whole = geodesic_patches(mesh, 0.1 * diameter(mesh), 3, 8, turn).exists.transpose(0, 2, 1)
     assert 0 < whole.mean() < 1
     np.testing.assert_array_equal(np.diff(arrays["first"]), 3 * whole.ravel())
     patches = by_rows_and_columns(arrays, 20)

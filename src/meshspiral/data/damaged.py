@@ -65,7 +65,7 @@ def damaged(shape: Shape, settings: DamageSettings, rng: np.random.Generator) ->
         vertices = warped(vertices, rng.uniform(0, settings.warp), mesh.size, rng)
     noise = rng.uniform(0, settings.noise) * mesh.size
     vertices = vertices + rng.normal(scale=noise, size=vertices.shape)
-    whole = (mesh.size * np.exp(rng.uniform(-settings.size, settings.size))) ** 2
+    complete_area = (mesh.size * np.exp(rng.uniform(-settings.size, settings.size))) ** 2
     faces = mesh.faces
     if rng.random() < settings.share:
         lost = np.zeros(len(vertices), dtype=bool)
@@ -80,7 +80,7 @@ def damaged(shape: Shape, settings: DamageSettings, rng: np.random.Generator) ->
             faces = faces[kept]
     used, faces = used_vertices(faces)
     points = shape.points and SurfacePoints(*(array[used] for array in shape.points))
-    left = holes.close_holes(Mesh(vertices[used], faces, mesh.name, float(whole)))
+    left = holes.close_holes(Mesh(vertices[used], faces, mesh.name, float(complete_area)))
     return Shape(left, shape.labels[used], shape.template_size, points)
 
 

@@ -137,7 +137,9 @@ class Recipe:
             load_task(task, self.cache, check=False)
         arrays = {"vertices": mesh.vertices, "faces": mesh.faces, "labels": shape.labels}
         arrays |= shape.points._asdict() if shape.points else {}
-        arrays |= {} if mesh.whole is None else {"whole": np.array(mesh.whole)}
+        arrays |= (
+            {} if mesh.complete_area is None else {"complete_area": np.array(mesh.complete_area)}
+        )
         key = digest(*(array for _, array in sorted(arrays.items())))
         self.cache.get("shapes", key, lambda: arrays, check=False)
         return Prepared(
@@ -163,8 +165,8 @@ class Recipe:
         described, shape, arrays, frames = found
         if prepared.table in tables:
             arrays = tables[prepared.table] = tables[prepared.table] or arrays
-        whole = float(shape["whole"]) if "whole" in shape else None
-        mesh = Mesh(shape["vertices"], shape["faces"], prepared.name, whole)
+        complete_area = float(shape["complete_area"]) if "complete_area" in shape else None
+        mesh = Mesh(shape["vertices"], shape["faces"], prepared.name, complete_area)
         item = described_tensors(described, mesh, self.features)
         extra = [] if frames is None else [frames["frames"]]
         item |= self.neighbourhood.tensors(arrays, mesh, *extra)

@@ -38,7 +38,7 @@ class Task:
 def frame_task(mesh: Mesh, frame: Frame) -> Task:
     """The local frames of a mesh: `frames` float32 [V, 3, 3], see `local_frames`."""
     version = code_version(meshes, shot, sys.modules[__name__])
-    key = digest(mesh.vertices, mesh.faces, mesh.whole, *frame, version)
+    key = digest(mesh.vertices, mesh.faces, mesh.complete_area, *frame, version)
     return Task("frames", key, _frames, (mesh, frame))
 
 
@@ -62,7 +62,7 @@ def _descriptor_key(mesh: Mesh, descriptor: Descriptor, *more: str) -> str:
         repr(sorted(descriptor.settings.model_dump().items())),
         mesh.vertices,
         mesh.faces,
-        mesh.whole,
+        mesh.complete_area,
         code_version(*descriptor.modules, *sources(descriptor), meshes, sys.modules[__name__]),
     )
 

@@ -421,6 +421,8 @@ def upgraded(values: dict[str, Any]) -> dict[str, Any]:
     data.setdefault("xyz", {"rotate": False})
     if values["neighbourhood"].get("name") == "patch":
         values["neighbourhood"].setdefault("ring_width", 2.0)
+    if values["neighbourhood"].get("name") == "disk" and "most" in values["neighbourhood"]:
+        values["neighbourhood"]["max_vertices"] = values["neighbourhood"].pop("most")
     if values["neighbourhood"].get("name") == "spiral":
         for key, value in STARTED.items():
             values["neighbourhood"].setdefault(key, value)

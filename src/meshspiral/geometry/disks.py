@@ -30,17 +30,17 @@ class DiskTable(NamedTuple):
 
 
 def geodesic_disks(
-    mesh: Mesh, radius: float, most: int, turn: np.ndarray | None = None
+    mesh: Mesh, radius: float, max_vertices: int, turn: np.ndarray | None = None
 ) -> DiskTable:
     """The vertices within a geodesic radius, with polar coordinates (Melvaer, Reimers 2012).
 
-    A disk of more than `most` vertices keeps the vertex itself and others evenly: of those ordered
-    by distance, every n-th for a fitting n, the last included.
+    A disk of more than `max_vertices` vertices keeps the vertex itself and others evenly: of those
+    ordered by distance, every n-th for a fitting n, the last included.
 
     Args:
         mesh: The surface.
         radius: In the mesh's unit.
-        most: The largest number of vertices of a disk.
+        max_vertices: The largest number of vertices of a disk.
         turn: float [V], radians by which the zero direction of each vertex is turned
             counter-clockwise. None for no turn.
 
@@ -49,17 +49,17 @@ def geodesic_disks(
         is the vertex alone.
 
     Raises:
-        ValueError: `radius` is not positive and finite, or `most` is below 1.
+        ValueError: `radius` is not positive and finite, or `max_vertices` is below 1.
     """
     check_radius(radius)
-    if most < 1:
-        raise ValueError(f"most must be at least 1, got {most}")
+    if max_vertices < 1:
+        raise ValueError(f"max_vertices must be at least 1, got {max_vertices}")
     neighbours, first = one_rings(mesh)
     left = left_corners(mesh.faces, neighbours, first)
     surface = mesh.vertices, neighbours, first, left
     count = len(mesh.vertices)
     turn = np.zeros(count) if turn is None else np.asarray(turn, dtype=np.float64)
-    shape = (count, min(most, count))
+    shape = (count, min(max_vertices, count))
     table = DiskTable(np.full(shape, -1, np.int32), *(np.zeros(shape, np.float32) for _ in "rt"))
     longest = _all_disks(*surface, face_sectors(*surface), turn, float(radius), *table)
     return DiskTable(*(np.ascontiguousarray(array[:, :longest]) for array in table))
@@ -69,8 +69,8 @@ def geodesic_disks(
 def _all_disks(
     vertices, neighbours, first, left, sectors, turn, radius, indices, distances, angles
 ):
-    """Write the rows of a `DiskTable` with `most` columns; return the length of the longest."""
-    count, most = indices.shape
+    """Write the rows of a `DiskTable`, [V, max_vertices]; return the length of the longest."""
+    count, max_vertices = indices.shape
     distance, angle = np.full(count, np.inf), np.zeros(count)
     updates, disk = np.zeros(count, np.int32), np.empty(count, np.int32)
     longest = 1
@@ -81,7 +81,7 @@ def _all_disks(
         indices[v, 0] = v
         others = disk[1:size]
         order = others[np.argsort(distance[others], kind="mergesort")]
-        kept = min(len(order), most - 1)
+        kept = min(len(order), max_vertices - 1)
         for k in range(kept):
             u = order[(k + 1) * len(order) // kept - 1]
             indices[v, k + 1], distances[v, k + 1] = u, distance[u]

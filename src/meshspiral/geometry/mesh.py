@@ -25,7 +25,7 @@ class Mesh:
         vertices: float64 [V, 3], coordinates in any unit of length.
         faces: int32 [F, 3], vertex indices, counter-clockwise as seen from outside.
         name: Used in messages.
-        whole: Area of the complete surface, of which the mesh shows a part; None: its own.
+        complete_area: Area of the complete surface, of which the mesh shows a part; None: its own.
 
     Raises:
         MeshError: The shapes or types are wrong; there is no vertex; a coordinate is not finite; a
@@ -36,7 +36,7 @@ class Mesh:
     vertices: np.ndarray
     faces: np.ndarray
     name: str = "mesh"
-    whole: float | None = None
+    complete_area: float | None = None
 
     def __post_init__(self) -> None:
         vertices = np.ascontiguousarray(self.vertices, dtype=np.float64)
@@ -121,7 +121,7 @@ class Mesh:
     @cached_property
     def size(self) -> float:
         """The length to which radii relate: the square root of the complete surface's area."""
-        return float(np.sqrt(self.area if self.whole is None else self.whole))
+        return float(np.sqrt(self.area if self.complete_area is None else self.complete_area))
 
     @cached_property
     def vertex_areas(self) -> np.ndarray:
@@ -152,11 +152,11 @@ class Mesh:
         """
         inverse = np.empty(len(order), dtype=np.int32)
         inverse[order] = np.arange(len(order), dtype=np.int32)
-        return Mesh(self.vertices[order], inverse[self.faces], self.name, self.whole)
+        return Mesh(self.vertices[order], inverse[self.faces], self.name, self.complete_area)
 
     def with_faces(self, faces: np.ndarray) -> Mesh:
         """The same vertices with other faces, int [F, 3]."""
-        return Mesh(self.vertices, faces, self.name, self.whole)
+        return Mesh(self.vertices, faces, self.name, self.complete_area)
 
 
 def used_vertices(faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

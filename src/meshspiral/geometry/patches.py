@@ -37,7 +37,7 @@ class PatchTable(NamedTuple):
     weights: np.ndarray
 
     @property
-    def whole(self) -> np.ndarray:
+    def exists(self) -> np.ndarray:
         """bool [V, rings, rays]: whether each sample exists."""
         return self.weights.any(axis=-1)
 
@@ -87,7 +87,7 @@ def geodesic_patches(
     _trace_all(*surface, exits, sectors, turn, float(radius), clamp, indices, weights)
     table = PatchTable(indices, weights)
     if clamp:
-        missing = ~table.whole
+        missing = ~table.exists
         indices[missing] = missing.nonzero()[0][:, None]
         weights[missing] = 1.0, 0.0, 0.0
     return table

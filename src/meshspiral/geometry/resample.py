@@ -84,4 +84,4 @@ def resampled(mesh: Mesh, vertices: int) -> Mesh:
             f"{mesh.name}: nothing is left of the surface when it is resampled to "
             f"{vertices} vertices"
         )
-    return Mesh(points[used], faces, mesh.name, mesh.whole)
+    return Mesh(points[used], faces, mesh.name, mesh.complete_area)

@@ -49,10 +49,10 @@ def sampled_places(
     clockwise = -np.arange(rays) % rays
     indices, weights = (array[:, :, clockwise].reshape(count, -1, 3) for array in table)
     own = np.repeat(np.arange(count, dtype=np.int32)[:, None, None], 3, axis=2)
-    whole = np.zeros((count, 1, 3), np.float32)
-    whole[..., 0] = 1.0
+    centre = np.zeros((count, 1, 3), np.float32)
+    centre[..., 0] = 1.0
     return PatchTable(
-        np.concatenate([own, indices], axis=1), np.concatenate([whole, weights], axis=1)
+        np.concatenate([own, indices], axis=1), np.concatenate([centre, weights], axis=1)
     )
 
 

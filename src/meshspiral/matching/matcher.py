@@ -47,7 +47,7 @@ MESH_STAGES = (
     "descriptors",
     "neighbourhoods",
     "network",
-    "copies",
+    "ensemble",
     "refinement",
 )
 Report = Callable[[str], None]  # is told each stage when it begins; not every mesh has all
@@ -265,13 +265,13 @@ class Matcher:
     def _sized(self, mesh: Mesh, report: Report) -> Mesh:
         """The mesh with the area of the complete surface, if it is known or can be found."""
         if self._scale is not None:
-            whole = (self.template.size / self._scale) ** 2
-            return replace(mesh, whole=whole)
+            complete_area = (self.template.size / self._scale) ** 2
+            return replace(mesh, complete_area=complete_area)
         if not has_large_holes(mesh):
             return mesh
         report("size")
-        whole = (self.surest_size(mesh) * mesh.size) ** 2
-        return replace(mesh, whole=whole)
+        complete_area = (self.surest_size(mesh) * mesh.size) ** 2
+        return replace(mesh, complete_area=complete_area)
 
     def surest_size(self, mesh: Mesh) -> float:
         """The size of the complete surface at which the network is surest of its labels.
@@ -292,7 +292,9 @@ class Matcher:
             mesh = resampled(mesh, self._training_size)
         area, sure = mesh.area, []
         for factor in FACTORS:
-            probability = self._probability(normalize(replace(mesh, whole=factor**2 * area)))
+            probability = self._probability(
+                normalize(replace(mesh, complete_area=factor**2 * area))
+            )
             sure.append(np.average(probability, weights=mesh.vertex_areas))
         return FACTORS[int(np.argmax(sure))]
 
@@ -322,7 +324,7 @@ class Matcher:
         """
         embedding = self._embed(mesh, report)
         if self._ensemble:
-            report("copies")
+            report("ensemble")
             embedding = self._with_copies(mesh, embedding)
         prediction = self._predictor.predict(embedding)
         template, confidence = prediction.classes.cpu().numpy(), prediction.probability
@@ -380,7 +382,7 @@ class Matcher:
             if vertices == len(mesh.vertices):
                 continue
             copy = resample(mesh, vertices)
-            described = self._embed(replace(copy.mesh, whole=(size * mesh.size) ** 2))
+            described = self._embed(replace(copy.mesh, complete_area=(size * mesh.size) ** 2))
             weights = torch.from_numpy(copy.weights).to(described)
             corners = described[torch.from_numpy(copy.corners).to(described.device)]
             total, count = total + torch.einsum("wk,wkc->wc", weights, corners), count + 1
@@ -468,4 +470,6 @@ def normalize(mesh: Mesh) -> Mesh:
     """
     used = mesh.vertices[mesh.faces].reshape(-1, 3)
     centred = mesh.vertices - (used.min(axis=0) / 2 + used.max(axis=0) / 2)  # the sum may overflow
-    return Mesh(centred / mesh.size, mesh.faces, mesh.name, None if mesh.whole is None else 1.0)
+    return Mesh(
+        centred / mesh.size, mesh.faces, mesh.name, None if mesh.complete_area is None else 1.0
+    )

@@ -45,7 +45,7 @@ class Side:
         points: np.ndarray,
         colors: dict[str, np.ndarray],
     ):
-        self.noun, self.name, self.whole = noun, name, len(mesh.vertices)
+        self.noun, self.name, self.total = noun, name, len(mesh.vertices)
         shown = np.arange(len(mesh.vertices))
         if len(mesh.vertices) > MOST_VERTICES:
             thin = resampled(mesh, MOST_VERTICES)
@@ -58,9 +58,9 @@ class Side:
     @property
     def note(self) -> str | None:
         """A sentence on thinning; None if the mesh is shown as it is."""
-        if len(self.origin) == self.whole:
+        if len(self.origin) == self.total:
             return None
-        return f"The {self.noun} is shown with {len(self.origin):,} of {self.whole:,} vertices."
+        return f"The {self.noun} is shown with {len(self.origin):,} of {self.total:,} vertices."
 
     def packed(self, up: str, counterpart: np.ndarray, apart: np.ndarray) -> dict[str, Any]:
         """The side as JSON.

@@ -99,7 +99,7 @@ class Neighbourhood(ABC):
 
     def mesh_key(self, mesh: Mesh) -> tuple:
         """The arrays of the mesh on which `compute` depends; by default all of it."""
-        return mesh.vertices, mesh.faces, mesh.whole
+        return mesh.vertices, mesh.faces, mesh.complete_area
 
     @abstractmethod
     def compute(self, mesh: Mesh) -> Arrays:

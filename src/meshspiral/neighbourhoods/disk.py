@@ -29,8 +29,9 @@ class Disk(Neighbourhood, name="disk"):
         radius: float = Field(
             gt=0, description="radius of a disk over the square root of the surface area"
         )
-        most: int = Field(
-            ge=2, description="most vertices of a disk; denser ones keep some, evenly spread"
+        max_vertices: int = Field(
+            ge=2,
+            description="largest number of vertices of a disk, evenly spread in a denser one",
         )
         support: float = Field(
             gt=0, description="radius of the local frame over the square root of the area"
@@ -49,7 +50,7 @@ class Disk(Neighbourhood, name="disk"):
         directions = sampling.surface_directions(mesh, frames[:, 0])
         turn = np.where(np.isfinite(directions), directions, 0.0)
         radius = self.settings.radius * mesh.size
-        table = disks.geodesic_disks(mesh, radius, self.settings.most, turn)._asdict()
+        table = disks.geodesic_disks(mesh, radius, self.settings.max_vertices, turn)._asdict()
         return table | {"distances": table["distances"] / np.float32(radius)}
 
     def tensors(

@@ -72,9 +72,9 @@ class Patch(Neighbourhood, name="patch"):
             indices, weights, first = windows.gaussian_windows(mesh, *grid, settings.ring_width)
         else:
             table = patches.geodesic_patches(mesh, *grid)
-            whole = table.whole.ravel()
-            indices, weights = (array.reshape(-1, 3)[whole].ravel() for array in table)
-            first = 3 * np.concatenate([[0], np.cumsum(whole)])
+            exists = table.exists.ravel()
+            indices, weights = (array.reshape(-1, 3)[exists].ravel() for array in table)
+            first = 3 * np.concatenate([[0], np.cumsum(exists)])
         samples = csr_array((weights, indices, first), shape=(len(first) - 1, len(mesh.vertices)))
         rows = np.arange(len(first) - 1).reshape(-1, settings.rings, settings.rays)
         by_ray = samples[rows.transpose(0, 2, 1).ravel()]
