@@ -2,12 +2,13 @@
 
     python -m tests.robustness 5
     python -m tests.robustness 20 --rows mixed_1100 --run <run_folder>
+    python -m tests.robustness 10 --split val --run <run_folder>
 
-Labels that many of the 20 test bodies with the bundled network or that of a run. Prints for each
-change of the bodies, and for each option of the matcher, the share of exact matches, the mean error
-to the true point over the square root of the template's area, the share of errors up to 0.05, the
-share of flips, and the median seconds of a mesh. A flip is a label that is more than 0.1 off, but
-at most 0.05 from the mirror image of the true vertex.
+Labels that many of the 20 test bodies, or of the 10 for validation, with the bundled network or
+that of a run. Prints for each change of the bodies, and for each option of the matcher, the share
+of exact matches, the mean error to the true point over the square root of the template's area, the
+share of errors up to 0.05, the share of flips, and the median seconds of a mesh. A flip is a label
+that is more than 0.1 off, but at most 0.05 from the mirror image of the true vertex.
 """
 
 from __future__ import annotations
@@ -115,10 +116,11 @@ def main() -> None:
     parser = argparse.ArgumentParser()
     parser.add_argument("bodies", type=int)
     parser.add_argument("--run", type=Path)
+    parser.add_argument("--split", choices=["val", "test"], default="test")
     parser.add_argument("--rows", nargs="*", default=[], help="such as mixed_1100; all if none")
     words = parser.parse_args()
     bodies = Bodies(1500)
-    names = evenly(bodies.names["test"], words.bodies)
+    names = evenly(bodies.names[words.split], words.bodies)
     reference = ReferenceDistances(bodies.template, CACHE)
     originals = [bodies.load(name) for name in names]
     rng = np.random.default_rng(0)
