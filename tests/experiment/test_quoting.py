@@ -115,6 +115,8 @@ def test_files_without_a_key_may_have_any_name(tmp_path, monkeypatch):
     words = name_files(["b'c[1].ply", "x=y.ply"])
     assert value_of(words[0]) == "b'c[1].ply" and words[1] == "x=y.ply"
     (tmp_path / "x=y.ply").touch()
+    assert name_files(["source=a.ply", "b.ply"]) == ["source=a.ply", "target='b.ply'"]
+    assert name_files(["a.ply", "target=b.ply", "c.ply"])[2] == "c.ply"
     assert name_files(["a.ply", "x=y.ply"]) == ["source='a.ply'", "target='x=y.ply'"]
 
 

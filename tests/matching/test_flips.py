@@ -40,8 +40,10 @@ def test_the_sides_of_the_template(mirror):
     assert (sides == 0).mean() < 0.15
 
 
-def test_a_template_without_a_mirror_image_has_none():
-    assert mirror_images(BODIES.load("s8_walk").mesh, "z") is None
+@pytest.mark.parametrize("pose", ["s8_walk", "s8_t_pose"])
+def test_a_template_without_a_mirror_image_has_none(pose):
+    """A body in T pose is thin, so that its image from front to back is near too."""
+    assert mirror_images(BODIES.load(pose).mesh, "z") is None
 
 
 @pytest.mark.parametrize("parts", [[LEFT_ARM], [LEFT_ARM, RIGHT_ARM]], ids=["one arm", "both arms"])
@@ -78,36 +80,40 @@ def test_noise_and_a_body_that_is_all_mirrored_stay(mirror):
     np.testing.assert_array_equal(without_flips(mirror, mesh, TEMPLATE, mirror), mirror)
 
 
-def confused(matcher: Matcher, mirror: np.ndarray, monkeypatch) -> None:
-    """Let the network of a matcher take the left arm for the right one."""
-    original = matcher._predictor.predict
-
-    def predict(embedding, labels=None):
-        found = original(embedding, labels)
-        arm = LEFT_ARM[found.classes.numpy()]
-        found.classes.numpy()[arm] = mirror[found.classes.numpy()[arm]]
-        return found
-
-    monkeypatch.setattr(matcher._predictor, "predict", predict)
+def confused(matcher: Matcher, mirror: np.ndarray, part: np.ndarray, monkeypatch) -> None:
+    """Let the network of a matcher see at the vertices of a part what is on the other side."""
+    embed, seen = matcher._embed, np.where(part, mirror, TRUE)
+    monkeypatch.setattr(matcher, "_embed", lambda mesh, *report: embed(mesh, *report)[seen])
 
 
-def test_a_matcher_puts_parts_back_and_says_so(mirror, monkeypatch):
-    mesh = BODIES.load("s9_squat").mesh
-    opened = scan(mesh.vertices, mesh.faces, "a")
-    plain = Matcher.load().label(opened)
+SQUAT = BODIES.load("s9_squat").mesh
+OPENED = scan(SQUAT.vertices, SQUAT.faces, "a")
+LEFT_LEG = (np.mean([X.min(), X.max()]) < X) & (TEMPLATE.vertices[:, 2] < 0.4)
+
+
+@pytest.mark.parametrize(
+    "part, refine",
+    [(LEFT_LEG, None), (LEFT_ARM, "crf"), (LEFT_LEG, "zoomout")],
+    ids=["leg", "arm crf", "leg zoomout"],
+)
+def test_a_matcher_puts_parts_back_and_says_so(part, refine, mirror, monkeypatch):
+    matcher = Matcher.load(refine=refine, ensemble=False)
+    plain = matcher.label(OPENED)
     assert plain.flipped.mean() < 0.01
 
-    matcher = Matcher.load()
-    confused(matcher, mirror, monkeypatch)
-    labels, distributions = matcher.predict(opened)
-    assert (labels.flipped == LEFT_ARM).mean() > 0.98
-    assert (labels.template == plain.template).mean() > 0.98
-    match = FileMatch("a.ply", LabelledScan(opened, labels, distributions), None, None, None)
+    confused(matcher, mirror, part, monkeypatch)
+    labels, distributions = matcher.predict(OPENED)
+    assert (labels.flipped == part).mean() > 0.98
+    sides = sides_of(TEMPLATE, mirror)
+    assert (sides[labels.template[part]] * sides[TRUE[part]] >= 0).mean() > 0.99
+    match = FileMatch("a.ply", LabelledScan(OPENED, labels, distributions), None, None, None)
     [line] = [line for line in remark_lines(match) if "put back" in line]
     assert line.startswith(f"  left and right put back at {labels.flipped.sum()} vertices (")
 
+
+def test_a_matcher_keeps_flips_if_asked(mirror, monkeypatch):
     matcher = Matcher.load(unflip=False)
-    confused(matcher, mirror, monkeypatch)
-    kept = matcher.label(opened)
+    confused(matcher, mirror, LEFT_ARM, monkeypatch)
+    kept = matcher.label(OPENED)
     assert not kept.flipped.any()
     assert LEFT_ARM[kept.template].sum() < 5

@@ -17,13 +17,20 @@ from meshspiral.commands.match import main
 from meshspiral.data.files import atomic_file
 from meshspiral.experiment.schema import MatchConfig
 from meshspiral.matching.batch import find_sources
-from meshspiral.matching.job import MatchJob
+from meshspiral.matching.job import NOT_IN_KEY, MatchJob
 from meshspiral.matching.pair import match_file
 from tests.conftest import toy_shapes
 from tests.helpers import ROOT, VTK_CRASHES, start, wait_for
 
 TOYS = toy_shapes()
 SOURCE, TARGET = TOYS["test/0.ply"], TOYS["test/1.ply"]
+CONFIG = dict.fromkeys(MatchConfig.model_fields) | {
+    "smooth": False,
+    "repair": False,
+    "unflip": True,
+    "accelerator": "cpu",
+    "plugins": [],
+}
 
 
 def export(path, mesh):
@@ -87,10 +94,8 @@ def test_a_pair_is_matched_and_written(cli, trained, files):
 
 
 def test_the_stages_of_a_match_are_reported(trained, files):
-    settings = dict.fromkeys(MatchConfig.model_fields) | {"plugins": [], "accelerator": "cpu"}
-    settings |= {"source": str(files / "a.ply"), "target": str(files / "b.ply")}
-    settings |= {"run": str(trained), "smooth": True, "repair": False, "resample": True}
-    settings |= {"unflip": True, "ensemble": True}
+    settings = CONFIG | {"source": str(files / "a.ply"), "target": str(files / "b.ply")}
+    settings |= {"run": str(trained), "smooth": True, "resample": True, "ensemble": True}
     job = MatchJob(MatchConfig(**settings), render=False)
     stages = []
     match_file(job, settings["source"], files / "out", lambda *stage: stages.append(stage))
@@ -365,11 +370,45 @@ def test_many_are_matched_and_finished_ones_are_skipped(cli, trained, scans):
     after = {i: os.stat(f"out/{i}/match.npz").st_mtime_ns for i in range(3)}
     assert [after[i] == before[i] for i in range(3)] == [True, True, False]
 
-    code, out, _ = cli(*common, "smooth=true", program=main)  # other settings: all anew
+    code, out, _ = cli(*common, "unflip=false", program=main)  # other settings: all anew
     assert code == 0 and "3 meshes matched" in out
     code, out, _ = cli(common[0], *common[2:], program=main)  # no target
     assert code == 0 and "3 meshes matched" in out and not Path("out/0/map.txt").exists()
     assert not Path("out/target.npz").exists()
+
+
+def test_every_setting_that_changes_a_match_is_part_of_its_key(trained, files, monkeypatch):
+    monkeypatch.chdir(files)
+    config = {**CONFIG, "source": "a.ply", "target": "b.ply", "run": str(trained)}
+    others = {
+        "repair": True,
+        "resample": True,
+        "refine": "crf",
+        "smooth": True,
+        "unflip": False,
+        "ensemble": True,
+        "scale": 0.001,
+        "height": 1.7,
+        "transfer": "color",
+        "export": ["dense"],
+    }
+    assert MatchConfig.model_fields.keys() == NOT_IN_KEY | others.keys()
+    changes = [{}, *({name: value} for name, value in others.items())]
+    keys = {MatchJob(MatchConfig(**config | change), False).key("a.ply") for change in changes}
+    assert len(keys) == len(changes)
+    same = {"output": "elsewhere", "workers": 1, "picture": True, "accelerator": "cpu"}
+    assert MatchJob(MatchConfig(**config | same), False).key("a.ply") in keys
+
+
+def test_a_file_that_is_refused_now_loses_its_earlier_match(cli, trained, scans):
+    common = ["sources='scans/*'", f"run={trained}", "output=out", "workers=1"]
+    assert cli(*common, program=main)[0] == 0
+    assert "3 matches in out" in Path("out/index.html").read_text()
+    (scans / "1.ply").write_text("no mesh")
+    assert cli(*common, program=main)[0] == 1
+    page = Path("out/index.html").read_text()
+    assert "2 matches in out" in page and "not a readable PLY" in page
+    assert not list(Path("out/1").iterdir()) and Path("out/0/match.npz").exists()
 
 
 def test_results_are_no_sources_and_no_other_mesh_overwrites_them(cli, trained, files):

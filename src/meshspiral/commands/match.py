@@ -41,9 +41,10 @@ def name_files(words: list[str]) -> list[str]:
 
     Args:
         words: The words of a command line. One with the suffix of a mesh file is a file, unless it
-            has an = and no file has its name.
+            has an = and no file has its name. A role that a word names is taken.
     """
-    roles = iter(("source", "target"))
+    taken = {word.partition("=")[0] for word in words}
+    roles = iter([role for role in ("source", "target") if role not in taken])
     named = []
     for word in words:
         is_file = word.lower().endswith(SUFFIXES) and ("=" not in word or os.path.isfile(word))
@@ -121,7 +122,7 @@ def match_many(config: MatchConfig) -> Path:
     from meshspiral.matching.batch import find_sources, match_batch
     from meshspiral.matching.index import INDEX, write_index
     from meshspiral.matching.job import MatchJob
-    from meshspiral.matching.writing import TARGET_FILES, delete_files, write_target
+    from meshspiral.matching.writing import TARGET_FILES, delete_files, delete_match, write_target
 
     folder = Path(config.output or Path("outputs", "matches", legal_name(config.sources)))
     sources = find_sources(config.sources, folder)
@@ -141,7 +142,9 @@ def match_many(config: MatchConfig) -> Path:
         result.repaired,
         len(result.refused),
     )
-    write_index(folder, sources, result.refused.values())
+    for name in (refused := [name for name in sources if sources[name] in result.refused]):
+        delete_match(folder / name, sources[name])  # of an earlier content of the file
+    write_index(folder, sources.keys() - refused, result.refused.values())
     log.info("All of them: %s", folder / INDEX)
     delete_files(folder, (REFUSED,))
     if result.refused:

@@ -46,17 +46,19 @@ class Distributions(NamedTuple):
     side: np.ndarray | None = None
     sides: np.ndarray | None = None
 
-    @torch.inference_mode()
     def rows(self, rows: np.ndarray) -> np.ndarray:
         """Probabilities of the template's vertices, float [R, K], for some rows [R]."""
+        return np.exp(self.log_rows(rows))
+
+    @torch.inference_mode()
+    def log_rows(self, rows: np.ndarray) -> np.ndarray:
+        """Their logarithms, float [R, K]; -inf on the other side of the template."""
         x = self.embedding[torch.from_numpy(rows).to(self.embedding.device)]
         scores = torch.addmm(self.bias, x.to(self.weight.dtype), self.weight.T)
-        probability = torch.softmax(scores, dim=1).cpu().numpy()
         if self.side is not None:
-            other = self.side[rows, None] * self.sides < 0
-            probability = np.where(other, 0, probability)
-            probability /= np.maximum(probability.sum(axis=1, keepdims=True), TINY)
-        return probability
+            other = torch.from_numpy(self.side[rows, None] * self.sides < 0)
+            scores = scores.masked_fill(other.to(scores.device), -torch.inf)
+        return torch.log_softmax(scores, dim=1).cpu().numpy()
 
 
 def near_vertices(template: Mesh, radius: float = RADIUS) -> csr_array:
@@ -100,6 +102,17 @@ def near_confidence(found: Distributions, template: np.ndarray, near: csr_array)
 
     def probability(rows: np.ndarray, labels: np.ndarray) -> np.ndarray:
         return near[labels].multiply(found.rows(rows)).sum(axis=1)
+
+    return _of_pairs(known, pairs, probability)
+
+
+def label_confidence(found: Distributions, template: np.ndarray) -> np.ndarray:
+    """The predicted probability of each label, float32 [V]; 0 without one. Arguments as above."""
+    known = (template >= 0) & (found.row_of >= 0)
+    pairs = np.stack([found.row_of[known], template[known]], axis=1)
+
+    def probability(rows: np.ndarray, labels: np.ndarray) -> np.ndarray:
+        return found.rows(rows)[np.arange(len(rows)), labels]
 
     return _of_pairs(known, pairs, probability)
 

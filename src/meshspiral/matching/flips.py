@@ -37,8 +37,8 @@ def mirror_images(template: Mesh, up: str) -> np.ndarray | None:
         images = vertices.copy()
         images[:, axis] = vertices[:, axis].min() + vertices[:, axis].max() - images[:, axis]
         distances, nearest = tree.query(images)
-        found.append((distances.mean(), axis, nearest))
-    asymmetry, _, nearest = min(found)
+        found.append((distances.mean() / np.ptp(images[:, axis]), axis, distances.mean(), nearest))
+    _, _, asymmetry, nearest = min(found)  # a flat shape is near any image from front to back
     return nearest if asymmetry < ASYMMETRY else None
 
 

@@ -20,7 +20,10 @@ from meshspiral.matching.confidence import Distributions
 from meshspiral.matching.matcher import MESH_STAGES, Labels, Matcher, nearest_vertices
 from meshspiral.training.checkpoints import BUNDLED_RUN
 
-CONTENT = "flipped"  # part of the key: earlier versions wrote less, so it is done anew
+CONTENT = "sides"  # part of the key: earlier versions wrote other labels, so it is done anew
+# settings that change no match, and those whose files are in the key
+NOT_IN_KEY = {"source", "sources", "target", "run", "output", "picture", "accelerator"}
+NOT_IN_KEY |= {"workers", "plugins"}
 STAGES = ("reading", *MESH_STAGES)  # of a mesh file
 FileReport = Callable[[str, str], None]  # is told "source" or "target", and a stage that begins
 
@@ -159,11 +162,9 @@ class MatchJob:
 
     @cached_property
     def _shared_key(self) -> str:
-        config = self.config
-        files = [str(Path(config.run or BUNDLED_RUN) / BEST), *self.inputs]
-        settings = config.repair, config.resample, config.transfer, self.render
-        settings += config.refine, config.smooth, config.scale, config.height, str(config.export)
-        return digest(*map(_content, files), *settings, CONTENT)
+        files = [str(Path(self.config.run or BUNDLED_RUN) / BEST), *self.inputs]
+        settings = self.config.model_dump_json(exclude=NOT_IN_KEY)
+        return digest(*map(_content, files), settings, self.render, CONTENT)
 
 
 @lru_cache(maxsize=1)

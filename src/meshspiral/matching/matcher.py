@@ -30,6 +30,7 @@ from meshspiral.geometry.resample import resample, resampled
 from meshspiral.geometry.zoomout import TO, eigenfunctions, zoomout
 from meshspiral.matching.confidence import (
     Distributions,
+    label_confidence,
     map_confidence,
     near_confidence,
     near_vertices,
@@ -219,25 +220,29 @@ class Matcher:
         if self._needs_resampling(len(mesh.vertices)):
             report("resampling")
             coarse = resample(mesh, self._training_size)
-            template, confidence, flipped, found = self._predict(coarse.mesh, report)
+            template, flipped, found = self._predict(coarse.mesh, report)
             points = self._points(template, found)
             nearest = coarse.corners[np.arange(len(mesh.vertices)), coarse.weights.argmax(axis=1)]
             points = self._interpolate(points[coarse.corners], coarse.weights, points[nearest])
             template = self._nearest_vertices(points)
-            confidence, flipped = confidence[nearest], flipped[nearest]
+            flipped = flipped[nearest]
         else:
-            template, confidence, flipped, found = self._predict(mesh, report)
+            template, flipped, found = self._predict(mesh, report)
             points, nearest = self._points(template, found), np.arange(len(template))
         missing = scan.vertex_of < 0
-        template, confidence, points, flipped, row_of = (
-            values[scan.vertex_of] for values in (template, confidence, points, flipped, nearest)
+        template, points, flipped, row_of = (
+            values[scan.vertex_of] for values in (template, points, flipped, nearest)
         )
-        template[missing], confidence[missing], points[missing] = -1, 0.0, np.nan
-        flipped[missing], row_of[missing] = False, -1
-        distributions = found._replace(row_of=row_of)
-        around = near_confidence(distributions, template, self._near_vertices)
-        labels = Labels(template.astype(np.int32), points, confidence, around, flipped)
-        return labels, distributions
+        template[missing], points[missing], flipped[missing], row_of[missing] = (
+            -1,
+            np.nan,
+            False,
+            -1,
+        )
+        found = found._replace(row_of=row_of)
+        confidence = label_confidence(found, template)
+        around = near_confidence(found, template, self._near_vertices)
+        return Labels(template.astype(np.int32), points, confidence, around, flipped), found
 
     def match(self, source: Scan, target: Scan) -> Match:
         """Map the vertices of a source to those of a target.
@@ -309,54 +314,39 @@ class Matcher:
         factor = self._predictor.neighbourhood.density_range
         return not self._training_size / factor <= vertices <= self._training_size * factor
 
-    def _predict(
-        self, mesh: Mesh, report: Report
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, Distributions]:
-        """Predict for each vertex of a mesh a template vertex and its probability.
+    def _predict(self, mesh: Mesh, report: Report) -> tuple[np.ndarray, np.ndarray, Distributions]:
+        """Predict for each vertex of a mesh a template vertex.
 
         Args:
             mesh: W vertices, normalized.
             report: As for `predict`.
 
         Returns:
-            Vertices of the template, int64 [W], their probabilities, float32 [W], `flipped` of
-            `Labels`, bool [W], and the distributions of all W vertices.
+            Vertices of the template, int64 [W], `flipped` of `Labels`, bool [W], and the
+            distributions of all W vertices.
         """
         embedding = self._embed(mesh, report)
         if self._ensemble:
             report("ensemble")
             embedding = self._with_copies(mesh, embedding)
-        prediction = self._predictor.predict(embedding)
-        template, confidence = prediction.classes.cpu().numpy(), prediction.probability
+        everything = np.arange(len(embedding))
+        found = Distributions(embedding, *self._predictor.head, everything)
+        template = self._predictor.predict(embedding).classes.cpu().numpy()
         flipped = np.zeros(len(template), dtype=bool)
         if self._refine is not None:
             report("refinement")
-            scores = self._log_probability(embedding)
-            template = self._mean_field(scores, mesh)
+            template = self._mean_field(found.log_rows(everything), mesh)
         if self._mirror is not None:
             mirrored = without_flips(template, mesh, self.template, self._mirror)
             flipped = mirrored != template
-            of_flipped = self._log_probability(embedding[torch.from_numpy(flipped)])
-            template[flipped] = likeliest_near(of_flipped, mirrored[flipped], self.template)
+        if flipped.any():
+            rows, side = np.flatnonzero(flipped), np.where(flipped, self._sides[mirrored], 0)
+            found = found._replace(side=side, sides=self._sides)
+            template[rows] = likeliest_near(found.log_rows(rows), mirrored[rows], self.template)
         if self._refine == "zoomout":
             template = zoomout(*eigenfunctions(mesh, TO), self._eigenfunctions, template)
-            template = likeliest_near(scores, template, self.template)
-        if self._refine is not None:
-            confidence = self._predictor.predict(embedding, torch.from_numpy(template)).of_label
-        confidence = confidence.float().cpu().numpy()
-        found = Distributions(embedding, *self._predictor.head, np.arange(len(template)))
-        if flipped.any():
-            side = np.where(flipped, self._sides[template], 0)
-            found = found._replace(side=side, sides=self._sides)
-            rows = np.flatnonzero(flipped)
-            confidence[rows] = found.rows(rows)[np.arange(len(rows)), template[rows]]
-        return template, confidence, flipped, found
-
-    def _log_probability(self, embedding: torch.Tensor) -> np.ndarray:
-        """Of each template vertex, float32 [W, K], from the input of the last layer, [W, C]."""
-        weight, bias = self._predictor.head
-        scores = torch.addmm(bias, embedding.to(weight.dtype), weight.T)
-        return torch.log_softmax(scores, 1).cpu().numpy()
+            template = likeliest_near(found.log_rows(everything), template, self.template)
+        return template, flipped, found
 
     def _embed(self, mesh: Mesh, report: Report = lambda stage: None) -> torch.Tensor:
         """The input of the network's last layer, [W, C], for each vertex of a mesh."""

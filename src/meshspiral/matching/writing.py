@@ -105,6 +105,13 @@ def is_finished(job: MatchJob, path: str, folder: Path) -> bool:
         return False
 
 
+def delete_match(folder: Path, path: str) -> None:
+    """Delete the match of a source, if the folder has it."""
+    result = _read_result(folder)
+    if result is not None and result[1] == _absolute(path):
+        delete_files(folder, SOURCE_FILES)
+
+
 def check_inputs(folder: Path, *inputs: str) -> None:
     """Raise DataError if a file to be written to the folder would overwrite an input."""
     outputs = {(folder / name).resolve() for name in SOURCE_FILES + TARGET_FILES}
