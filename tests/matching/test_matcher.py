@@ -18,6 +18,7 @@ import meshspiral
 from meshspiral import Matcher, Mesh, open_scan, scan
 from meshspiral.data.datasets.bodies import Bodies
 from meshspiral.experiment.run_folder import BEST, RunError
+from meshspiral.geometry.faces import directed_edges
 from meshspiral.geometry.mesh import MeshError
 from meshspiral.matching.matcher import FACTORS, Labels, nearest_vertices, normalize
 from tests.conftest import toy_shapes
@@ -153,10 +154,18 @@ def test_confidence_after_smoothing_is_that_of_the_refined_label(trained):
     assert (smooth.confidence[~same] <= raw.confidence[~same]).all()
 
 
-def test_only_zoomout_needs_a_complete_surface(trained):
+def test_an_open_surface_is_refined_by_its_neighbours(trained):
     half = scan_of(SOURCE, faces=SOURCE.faces[: len(SOURCE.faces) // 2])
-    found = Matcher.load(trained, refine="crf").label(half)
-    assert (found.template >= 0).sum() == len(half.mesh.vertices)
+    raw, refined = (
+        Matcher.load(trained, refine=refine, ensemble=False).label(half) for refine in (None, "crf")
+    )
+    a, b = directed_edges(SOURCE.faces[: len(SOURCE.faces) // 2]).T
+
+    def apart(labels: np.ndarray) -> np.ndarray:
+        return np.linalg.norm(TEMPLATE.vertices[labels[a]] - TEMPLATE.vertices[labels[b]], axis=1)
+
+    assert (refined.template >= 0).sum() == len(half.mesh.vertices)  # those on a face
+    assert apart(refined.template).mean() < 0.9 * apart(raw.template).mean()
 
 
 # ------------------------------------------------------------------------------------------ size

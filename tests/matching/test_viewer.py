@@ -76,6 +76,12 @@ def test_without_a_target_the_template_is_beside_the_source(matcher, match):
     template, source = data_of(view_html(alone, matcher.template, matcher.up, None))
     assert template["noun"] == "template"
     np.testing.assert_array_equal(unpacked(source["other"], np.int32), match.source.labels.template)
+    of_template = unpacked(template["confidence"], np.float32)
+    labelled_with = unpacked(template["other"], np.int32)
+    of_source = match.source.labels.near_confidence
+    np.testing.assert_allclose(of_template, of_source[labelled_with])
+    assert of_template.min() < of_template.max() < 1
+    assert len(unpacked(template["colors"]["confidence"], np.uint8)) == 3 * len(of_template)
 
 
 def test_carried_colours_can_be_shown(matcher, match):

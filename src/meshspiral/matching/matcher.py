@@ -281,7 +281,8 @@ class Matcher:
     def surest_size(self, mesh: Mesh) -> float:
         """The size of the complete surface at which the network is surest of its labels.
 
-        The mean probability of the labels decides, on the mesh at the density of training.
+        The mean probability of the labels decides, on a mesh with at most as many vertices as one
+        of training.
 
         Args:
             mesh: A part of a surface.

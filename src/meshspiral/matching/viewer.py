@@ -100,6 +100,10 @@ def view_html(match: FileMatch, template: Mesh, up: str, carried: np.ndarray | N
     links = [_counterparts(*pair, template.size) for pair in ((other, source), (source, other))]
     found = match.source.labels.template if match.map is None else match.map
     links[1] = _mapped(source, other, found, template.size)
+    if match.target is None:  # a template is as sure as the vertices that are labelled with it
+        counterpart = links[0][0]
+        other.confidence = np.where(counterpart < 0, 0, source.confidence[counterpart])
+        other.colors["confidence"] = confidence_colors(other.confidence)
     sides = [side.packed(up, *link) for side, link in zip((other, source), links, strict=True)]
     names = {"correspondence": "correspondence", "confidence": "confidence"}
     names |= {"carried": "carried from the target"} if "carried" in source.colors else {}
@@ -119,10 +123,7 @@ def sides_of(match: FileMatch, template: Mesh, carried: np.ndarray | None) -> tu
     source, target = match.source, match.target
     confidence = source.on_mesh(match.source_confidence)
     if target is None:
-        colors = {
-            "correspondence": template_colors(template),
-            "confidence": np.ones((len(template.vertices), 3)),
-        }
+        colors = {"correspondence": template_colors(template)}
         everyone = np.arange(len(template.vertices))
         other = Side(
             "template",
