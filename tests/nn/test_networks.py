@@ -29,6 +29,12 @@ def test_conv_net_has_about_as_many_parameters_as_the_others(length):
     assert parameters(ConvNet(544, 6890, length)) == pytest.approx(2.7e6, rel=0.06)
 
 
+def test_the_first_dense_layer_may_be_wider():
+    fcs, n = parameters(FCSNet(544, 6890, 20)), 20
+    added = 64 - 16
+    assert parameters(FCSNet(544, 6890, n, lifted=64)) == fcs + added * (544 + 1) + n * added * 100
+
+
 def test_metric_information_adds_two_channels_to_the_layers_that_take_it():
     fcs, n = parameters(FCSNet(544, 6890, 20)), 20
     assert parameters(FCSNet(544, 6890, n, metric=True)) == fcs + 2 * n * (100 + 150 + 200)

@@ -66,7 +66,7 @@ class Network(nn.Module):
             in_features: Number of channels of the descriptor.
             num_classes: Number of vertices of the template.
         """
-        options = settings.model_dump(exclude={"name"})
+        options = settings.model_dump(exclude={"name"}, exclude_unset=True)
         return cls(in_features, num_classes, **options, **cls.options(neighbourhood))
 
     @classmethod

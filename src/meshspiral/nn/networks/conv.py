@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import torch
 from pydantic import Field
@@ -95,10 +96,8 @@ class ConvNet(OneLengthNet, name="conv"):
         channels: Number of output channels of each of the three layers.
         widening: Number of hidden channels of a layer over that of its output channels.
         taps: Length of the convolution's kernel, odd.
-        metric: Whether layers read metric information.
-        metric_layers: "all" layers read it, or the "first" alone.
-        dropout: Probability of dropout after FC16 and FC256.
-        feature_scale: Constant factor of the descriptors.
+        **options: `metric`, `metric_layers`, `dropout`, `feature_scale` and `lifted` of
+            `SpiralNet`.
     """
 
     title = "CONV-NET"
@@ -115,17 +114,12 @@ class ConvNet(OneLengthNet, name="conv"):
         channels: Sequence[int] = (128, 192, 256),
         widening: int = 2,
         taps: int = 3,
-        metric: bool = False,
-        metric_layers: str = "all",
-        dropout: float = 0.3,
-        feature_scale: float = 1.0,
+        **options: Any,
     ):
         if taps % 2 == 0:
             raise ValueError(f"model.taps must be odd, got {taps}")
         self.seq_len, self.widening, self.taps = seq_len, widening, taps
-        super().__init__(
-            in_features, num_classes, channels, metric, metric_layers, dropout, feature_scale
-        )
+        super().__init__(in_features, num_classes, channels, **options)
 
     def spiral_layer(self, in_features: int, out_features: int, metric: bool) -> nn.Module:
         hidden = self.widening * out_features

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 from torch import nn
 
@@ -18,10 +19,8 @@ class FCSNet(OneLengthNet, name="fcs"):
         num_classes: Number of vertices of the template.
         seq_len: Number of vertices of every spiral.
         channels: Number of output channels of each of the three layers.
-        metric: Whether layers read metric information.
-        metric_layers: "all" layers read it, or the "first" alone.
-        dropout: Probability of dropout after FC16 and FC256.
-        feature_scale: Constant factor of the descriptors.
+        **options: `metric`, `metric_layers`, `dropout`, `feature_scale` and `lifted` of
+            `SpiralNet`.
     """
 
     title = "FCS-NET"
@@ -32,15 +31,10 @@ class FCSNet(OneLengthNet, name="fcs"):
         num_classes: int,
         seq_len: int,
         channels: Sequence[int] = (100, 150, 200),
-        metric: bool = False,
-        metric_layers: str = "all",
-        dropout: float = 0.3,
-        feature_scale: float = 1.0,
+        **options: Any,
     ):
         self.seq_len = seq_len
-        super().__init__(
-            in_features, num_classes, channels, metric, metric_layers, dropout, feature_scale
-        )
+        super().__init__(in_features, num_classes, channels, **options)
 
     def spiral_layer(self, in_features: int, out_features: int, metric: bool) -> nn.Module:
         return SpiralLinear(in_features, out_features, self.seq_len, metric)

@@ -20,8 +20,7 @@ class GCNN3(ThreeLayerNet, name="gcnn3"):
         channels: Number of output channels of each of the three layers.
         rings: Number of rings of a patch.
         rays: Number of rays of a patch, even.
-        dropout: Probability of dropout after FC16 and FC256.
-        feature_scale: Constant factor of the descriptors.
+        **options: `dropout`, `feature_scale` and `lifted` of `ThreeLayerNet`.
     """
 
     title = "GCNN3"
@@ -34,11 +33,10 @@ class GCNN3(ThreeLayerNet, name="gcnn3"):
         channels: Sequence[int] = (32, 64, 128),
         rings: int = 5,
         rays: int = 16,
-        dropout: float = 0.3,
-        feature_scale: float = 1.0,
+        **options: Any,
     ):
         self.rings, self.rays = rings, rays
-        super().__init__(in_features, num_classes, channels, dropout, feature_scale)
+        super().__init__(in_features, num_classes, channels, **options)
 
     @classmethod
     def options(cls, neighbourhood: Any) -> dict[str, Any]:

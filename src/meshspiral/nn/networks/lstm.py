@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 from pydantic import Field
 from torch import nn
@@ -18,11 +19,9 @@ class LSTMNet(SpiralNet, name="lstm"):
         in_features: Number of channels of the descriptor.
         num_classes: Number of vertices of the template.
         channels: Number of output channels of each of the three layers.
-        metric: Whether layers read metric information.
-        metric_layers: "all" layers read it, or the "first" alone.
-        dropout: Probability of dropout after FC16 and FC256.
-        feature_scale: Constant factor of the descriptors.
         recompute: Whether to compute the LSTM's steps again in the backward pass, for less memory.
+        **options: `metric`, `metric_layers`, `dropout`, `feature_scale` and `lifted` of
+            `SpiralNet`.
     """
 
     title = "LSTM-NET"
@@ -37,16 +36,11 @@ class LSTMNet(SpiralNet, name="lstm"):
         in_features: int,
         num_classes: int,
         channels: Sequence[int] = (150, 200, 250),
-        metric: bool = False,
-        metric_layers: str = "all",
-        dropout: float = 0.3,
-        feature_scale: float = 1.0,
         recompute: bool = False,
+        **options: Any,
     ):
         self.recompute = recompute
-        super().__init__(
-            in_features, num_classes, channels, metric, metric_layers, dropout, feature_scale
-        )
+        super().__init__(in_features, num_classes, channels, **options)
 
     def spiral_layer(self, in_features: int, out_features: int, metric: bool) -> nn.Module:
         return SpiralLSTM(in_features, out_features, metric, self.recompute)

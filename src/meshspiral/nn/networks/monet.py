@@ -21,8 +21,7 @@ class MoNet(ThreeLayerNet, name="monet"):
         channels: Number of output channels of each of the three layers.
         rings: Number of distances at which Gaussians begin.
         rays: Number of directions in which they begin.
-        dropout: Probability of dropout after FC16 and FC256.
-        feature_scale: Constant factor of the descriptors.
+        **options: `dropout`, `feature_scale` and `lifted` of `ThreeLayerNet`.
     """
 
     title = "MoNet"
@@ -39,11 +38,10 @@ class MoNet(ThreeLayerNet, name="monet"):
         channels: Sequence[int] = (32, 64, 128),
         rings: int = 3,
         rays: int = 8,
-        dropout: float = 0.3,
-        feature_scale: float = 1.0,
+        **options: Any,
     ):
         self.rings, self.rays = rings, rays
-        super().__init__(in_features, num_classes, channels, dropout, feature_scale)
+        super().__init__(in_features, num_classes, channels, **options)
 
     def layer(self, i: int, in_features: int, out_features: int) -> nn.Module:
         return GaussianMixtureConv(in_features, out_features, self.rings, self.rays)

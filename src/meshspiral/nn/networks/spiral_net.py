@@ -24,8 +24,7 @@ class SpiralNet(ThreeLayerNet):
         channels: Number of output channels of each of the three layers.
         metric: Whether layers read metric information, see `metric_features`.
         metric_layers: "all" layers read it, or the "first" alone.
-        dropout: Probability of dropout after FC16 and FC256.
-        feature_scale: Constant factor of the descriptors.
+        **options: `dropout`, `feature_scale` and `lifted` of `ThreeLayerNet`.
 
     Raises:
         ValueError: `metric_layers` is neither "all" nor "first".
@@ -44,15 +43,14 @@ class SpiralNet(ThreeLayerNet):
         in_features: int,
         num_classes: int,
         channels: Sequence[int],
-        metric: bool,
-        metric_layers: str,
-        dropout: float,
-        feature_scale: float,
+        metric: bool = False,
+        metric_layers: str = "all",
+        **options: Any,
     ):
         if metric_layers not in (choices := get_args(MetricLayers)):
             raise ValueError(f"metric_layers must be one of {choices}, got {metric_layers!r}")
         self.metric, self.metric_layers = metric, metric_layers
-        super().__init__(in_features, num_classes, channels, dropout, feature_scale)
+        super().__init__(in_features, num_classes, channels, **options)
 
     def layer(self, i: int, in_features: int, out_features: int) -> nn.Module:
         takes_metric = self.metric and (i == 0 or self.metric_layers == "all")

@@ -27,12 +27,17 @@ class ThreeLayerNet(Network):
         dropout: Probability of dropout after FC16 and FC256.
         feature_scale: Constant factor of the descriptors. A descriptor of unit length with 544
             channels has entries of about 0.04, far below what the initial weights expect.
+        lifted: Number of channels after the first dense layer, FC16 in the paper.
     """
 
     class Settings(Network.Settings):
         channels: list[int] = Field(description="output channels of the three layers")
         dropout: float = Field(
             ge=0, lt=1, description="dropout after the first dense layer and before the last"
+        )
+
+        lifted: int = Field(
+            LIFTED, ge=1, description="channels after the first dense layer (paper: 16)"
         )
 
         @field_validator("channels")
@@ -47,14 +52,15 @@ class ThreeLayerNet(Network):
         in_features: int,
         num_classes: int,
         channels: Sequence[int],
-        dropout: float,
-        feature_scale: float,
+        dropout: float = 0.3,
+        feature_scale: float = 1.0,
+        lifted: int = LIFTED,
     ):
         super().__init__()
         self.feature_scale = feature_scale
-        self.lift = dense(in_features, LIFTED)
+        self.lift = dense(in_features, lifted)
         self.layers = nn.ModuleList(
-            self.layer(i, *sizes) for i, sizes in enumerate(pairwise((LIFTED, *channels)))
+            self.layer(i, *sizes) for i, sizes in enumerate(pairwise((lifted, *channels)))
         )
         self.neck = dense(channels[-1], LAST)
         self.head = dense(LAST, num_classes)
