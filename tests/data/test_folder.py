@@ -1,6 +1,7 @@
 """A folder of meshes: which files are used, in which order, and which are rejected."""
 
 import inspect
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -184,6 +185,21 @@ def test_links_and_labels_outside_the_folder_are_rejected(root):
     for labels in ["../../outside/{stem}.txt", str(outside / "{stem}.txt"), "out.txt"]:
         with pytest.raises(DataError, match="must be inside"):
             folder(root, train=["a/0.off"], labels=labels)
+
+
+def test_names_have_no_marks_of_versions(root):
+    for name in ("a@home", "a~2"):
+        shutil.copy(root / "a" / "0.off", root / f"{name}.off")
+    shapes = folder(root, train=["a@home.off", "a~2.off"], labels="identity")
+    assert shapes.names["train"] == ["a_home", "a_2"]
+    shutil.copy(root / "a" / "0.off", root / "a@2.off")
+    with pytest.raises(DataError, match="would both be named a_2"):
+        folder(root, train=["a~2.off", "a@2.off"], labels="identity")
+
+
+def test_a_list_of_meshes_may_begin_with_a_byte_order_mark(root):
+    (root / "list.txt").write_bytes(b"\xef\xbb\xbfa/0.off\n")
+    assert folder(root, train="list.txt", labels="identity").names["train"] == ["a_0"]
 
 
 def test_missing_or_invalid_arguments_are_rejected(root):

@@ -2,17 +2,23 @@
 
 from __future__ import annotations
 
+import os
+import resource
+import subprocess
+import sys
+
 import numpy as np
 import pytest
 import torch
 
 from meshspiral.data import dataset
+from meshspiral.data.dataset import MeshDataset
 from meshspiral.data.datasets.folder import Folder
 from meshspiral.data.sources import open_data
 from meshspiral.geometry.mesh import Mesh
 from tests.conftest import TOY_SPLIT, toy_shapes
 from tests.data.test_datamodule import recorded
-from tests.helpers import composed
+from tests.helpers import ROOT, composed
 
 
 @pytest.fixture
@@ -118,6 +124,49 @@ def test_readers_serve_the_same_batches(config):
     for split in ("train", "val"):
         for one, other in zip(alone[split], ahead[split], strict=True):
             assert one[0] == other[0] and one[2] == other[2] and torch.equal(one[1], other[1])
+
+
+def test_a_reader_serves_more_tensors_than_it_may_open_files(config):
+    """A tensor that a reader keeps after it was sent would hold a file open."""
+    data = opened(config("data.readers=1"))
+    train = data.datasets["train"]
+    many = [train._prepared[i % len(train)] for i in range(60)]
+    data.datasets["train"] = MeshDataset(data.recipe, many, {})
+    limits = resource.getrlimit(resource.RLIMIT_NOFILE)
+    resource.setrlimit(resource.RLIMIT_NOFILE, (len(os.listdir("/proc/self/fd")) + 60, limits[1]))
+    try:  # the reader inherits the limit
+        assert sum(1 for _ in data.train_dataloader()) == 60
+    finally:
+        resource.setrlimit(resource.RLIMIT_NOFILE, limits)
+
+
+def test_a_script_with_readers_ends(toy_overrides):
+    code = f"""if __name__ == "__main__":
+    from meshspiral.data.sources import open_data
+    from tests.helpers import composed
+
+    data = open_data(composed({[*toy_overrides, "data.readers=1"]!r}))
+    data.prepare()
+    loader = data.train_dataloader()
+    print(len(list(loader)))
+"""
+    done = subprocess.run(
+        [sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, timeout=120
+    )
+    assert done.returncode == 0 and done.stdout == f"{TOY_SPLIT['train']}\n", done.stderr
+
+
+def test_a_damaged_result_beside_a_missing_one_is_computed_again(config, tmp_path):
+    data = opened(config())
+    train = data.datasets["train"]
+    before, prepared = train[0]["features"].clone(), train._prepared[0]
+    file = tmp_path / "cache" / "shot" / f"{prepared.described[0]}.safetensors"
+    content = bytearray(file.read_bytes())
+    content[-1] ^= 64
+    file.write_bytes(content)
+    (tmp_path / "cache" / "spiral" / f"{prepared.table}.safetensors").unlink()
+    again = MeshDataset(data.recipe, train._prepared, {})
+    assert torch.equal(again[0]["features"], before)
 
 
 def test_half_the_space_changes_descriptors_by_a_rounding(config, tmp_path):

@@ -77,6 +77,13 @@ def test_training_shapes_may_share_tessellations(tmp_path):
     assert off.max() < 1e-9  # the shape's own surface, not that of the first
     own = shapes.load("val/0.ply").mesh
     assert own.faces.shape != first.mesh.faces.shape or (own.faces != first.mesh.faces).any()
+    tetrahedron = Mesh(np.eye(4, 3), [[0, 2, 1], [0, 1, 3], [1, 2, 3], [2, 0, 3]])
+    load = shapes.base.load
+    shapes.base.load = lambda name: (
+        Shape(tetrahedron, np.arange(4), 162) if name == "train/1.ply" else load(name)
+    )
+    with pytest.raises(DataError, match=r"data\.remesh\.shared needs shapes with the same faces"):
+        shapes.load("train/1.ply")
     with pytest.raises(DataError, match="at most 2, the number of training shapes, got 3"):
         Remeshed(Toys(), Cache(tmp_path), 1, "isotropic", 120, shared=3)
 

@@ -11,8 +11,10 @@ import sys
 import pytest
 import torch
 from omegaconf import OmegaConf
+from torch.utils.data import DataLoader, Dataset
 
 from meshspiral.data.settings import RemeshSettings, ShotSettings
+from meshspiral.experiment.entry import one_line
 from meshspiral.experiment.help import COMMANDS
 from meshspiral.experiment.run_folder import write_metrics
 from meshspiral.experiment.schema import (
@@ -23,6 +25,7 @@ from meshspiral.experiment.schema import (
     registered,
 )
 from meshspiral.experiment.sweeps import invocation, job_folder
+from meshspiral.geometry.mesh import MeshError
 from tests.helpers import QUICK, ROOT, clone_environment, composed
 
 
@@ -284,6 +287,19 @@ def test_a_failed_job_logs_its_error_and_the_others_run(cli, toy_overrides, tmp_
     assert "error: optim.lr must be above 0, got 0" in (failed / "train.log").read_text()
     assert (done / "metrics.json").is_file() and not (failed / "metrics.json").exists()
     assert "Traceback" not in out + err
+
+
+def test_an_error_in_a_reader_is_one_line():
+    class Broken(Dataset):
+        def __len__(self):
+            return 1
+
+        def __getitem__(self, i):
+            raise MeshError(f"mesh {i}: no faces")
+
+    with pytest.raises(MeshError, match="Traceback") as raised:
+        next(iter(DataLoader(Broken(), batch_size=None, num_workers=1)))
+    assert one_line(raised.value) == "mesh 0: no faces"
 
 
 def test_jobs_never_share_a_folder():

@@ -8,6 +8,7 @@ import shutil
 
 import pytest
 
+from meshspiral.data.shapes import DataError
 from meshspiral.experiment.run_folder import LAST, METRICS, RunError, Stopped, read_run_config
 from meshspiral.experiment.runs import resumed_config
 from meshspiral.training.callbacks import Speed
@@ -98,6 +99,16 @@ def test_the_config_says_the_new_number_and_the_run_is_unfinished(
     assert same_weights(whole, finished) and not same_weights(finished, two_epochs)
     assert (finished / METRICS).is_file()
     assert read_run_config(finished) == read_run_config(whole)
+
+
+def test_other_training_meshes_are_refused_before_anything_is_changed(finished, two_epochs, toy):
+    config = read_run_config(finished)
+    fewer = config.data.model_copy(update={"train": ["train/[0-2].ply"]})
+    optim = config.optim.model_copy(update={"epochs": 3})
+    with pytest.raises(DataError, match="the 3 training meshes are not those of the run"):
+        train(config.model_copy(update={"data": fewer, "optim": optim}), finished)
+    assert same_weights(finished, two_epochs) and (finished / METRICS).exists()
+    assert read_run_config(finished) == config
 
 
 @pytest.mark.parametrize("words", [[], ["optim.epochs=2"]])

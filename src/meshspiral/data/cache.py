@@ -25,7 +25,7 @@ from meshspiral.neighbourhoods.base import Arrays
 
 log = logging.getLogger(__name__)
 SUFFIX = ".safetensors"
-GEOMETRY = "meshspiral.geometry"
+FOLLOWED = ("meshspiral.geometry", "meshspiral.data.datasets")
 
 
 class CacheError(OSError):
@@ -37,8 +37,8 @@ def code_version(*modules: ModuleType) -> str:
     """A hash of source code, so that a change of code invalidates its results.
 
     Args:
-        modules: Their code counts, and that of all modules of `meshspiral.geometry` that they
-            import, directly or not.
+        modules: Their code counts, and that of all modules of FOLLOWED that they import, directly
+            or not.
     """
     sources: dict[str, str] = {}
     found = list(modules)
@@ -46,17 +46,17 @@ def code_version(*modules: ModuleType) -> str:
         module = found.pop()
         if module.__name__ not in sources:
             sources[module.__name__] = source = inspect.getsource(module)
-            found += _geometry_imports(source)
+            found += _imports(source)
     return digest(*(sources[name] for name in sorted(sources)))
 
 
-def _geometry_imports(source: str) -> list[ModuleType]:
+def _imports(source: str) -> list[ModuleType]:
     names = set()
     for node in ast.walk(ast.parse(source)):
-        if isinstance(node, ast.ImportFrom) and str(node.module).startswith(GEOMETRY):
+        if isinstance(node, ast.ImportFrom) and str(node.module).startswith(FOLLOWED):
             names |= {node.module, *(f"{node.module}.{alias.name}" for alias in node.names)}
         elif isinstance(node, ast.Import):
-            names |= {alias.name for alias in node.names if alias.name.startswith(GEOMETRY)}
+            names |= {alias.name for alias in node.names if alias.name.startswith(FOLLOWED)}
     return [sys.modules[name] for name in names & sys.modules.keys()]
 
 

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import atexit
+import weakref
 from collections import Counter
 from collections.abc import Iterable
 from functools import cached_property
 from itertools import islice
+from typing import Any
 
 import lightning as L
 import numpy as np
@@ -14,13 +17,20 @@ from joblib import cpu_count
 from torch.utils.data import DataLoader
 
 from meshspiral.data.cache import Cache
-from meshspiral.data.dataset import KEPT, EpochSampler, MeshDataset, ignore_signals, item_bytes
+from meshspiral.data.dataset import (
+    KEPT,
+    EpochSampler,
+    MeshDataset,
+    end_readers,
+    ignore_signals,
+    item_bytes,
+)
 from meshspiral.data.descriptors import Features
 from meshspiral.data.prepared import Recipe
 from meshspiral.data.reference import ReferenceDistances
 from meshspiral.data.shapes import SPLITS, DataError, Shape, ShapeSet
 from meshspiral.data.tensors import draw
-from meshspiral.geometry.digest import derived_seed
+from meshspiral.geometry.digest import derived_seed, digest
 from meshspiral.neighbourhoods import Neighbourhood
 from meshspiral.neighbourhoods.base import Batch
 
@@ -44,9 +54,9 @@ class CorrespondenceData(L.LightningDataModule):
         half: Keep descriptors as float16 in the cache.
         readers: Number of processes that read meshes ahead of the steps; None for one if the
             meshes do not fit into `KEPT` bytes of memory, else none. With `fresh`, one per core but
-            one, and at least one.
-        fresh: Train each epoch on other versions of the shapes. They are made while the epoch
-            before is trained, and cached.
+            one for each process that trains, and at least one.
+        fresh: Train each epoch on other versions of the shapes. Readers make them ahead of the
+            steps of the epoch, and they are cached.
 
     Raises:
         DataError: `fresh`, of shapes that have no other versions.
@@ -157,7 +167,8 @@ class CorrespondenceData(L.LightningDataModule):
         dataset = self.datasets[split]
         readers = self.readers
         if readers is None and self.fresh and split == "train":
-            readers = max(1, cpu_count() - 1)
+            processes = self.trainer.num_devices if self.trainer is not None else 1
+            readers = max(1, cpu_count() // processes - 1)
         elif readers is None:
             readers = int(item_bytes(dataset[0]) * dataset.sizes.sum() / dataset.sizes[0] > KEPT)
         ahead = {
@@ -166,7 +177,12 @@ class CorrespondenceData(L.LightningDataModule):
             "worker_init_fn": ignore_signals,
         }
         options = ahead if readers else {}
-        return DataLoader(dataset, batch_size=None, sampler=sampler, num_workers=readers, **options)
+        loader = DataLoader(
+            dataset, batch_size=None, sampler=sampler, num_workers=readers, **options
+        )
+        if readers:
+            atexit.register(end_readers, weakref.ref(loader))
+        return loader
 
     def _rank_and_world(self) -> tuple[int, int]:
         trainer = self.trainer
@@ -182,10 +198,21 @@ class CorrespondenceData(L.LightningDataModule):
             batch["features"] = self.features.drawn(batch["features"], generator)
         return draw(self.neighbourhood, batch, self.seed, "spirals", when, training=training)
 
-    def state_dict(self) -> dict[str, int]:
+    def state_dict(self) -> dict[str, Any]:
         progress = self.trainer.fit_loop.epoch_loop.batch_progress.current
         done = progress.completed
-        return {"skip": 0 if done >= self.trainer.num_training_batches else done}
+        skip = 0 if done >= self.trainer.num_training_batches else done
+        return {"skip": skip, "train": digest(*self.shapes.names["train"])}
 
-    def load_state_dict(self, state: dict[str, int]) -> None:
+    def load_state_dict(self, state: dict[str, Any]) -> None:
         self._skip = state["skip"]
+
+    def check_checkpoint(self, saved: dict[str, Any]) -> None:
+        """Raise DataError if the training meshes are not those of the run of a checkpoint."""
+        names = self.shapes.names["train"]
+        known = saved.get(type(self).__qualname__, {}).get("train")  # earlier versions: unknown
+        if known not in (None, digest(*names)):
+            raise DataError(
+                f"the {len(names)} training meshes are not those of the run that is resumed; to "
+                "train on others, start a run with init=<run_folder>"
+            )

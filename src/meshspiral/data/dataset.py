@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import signal
+import weakref
 from collections.abc import Iterator, Sequence
 
 import numpy as np
 import torch
 from torch.utils._pytree import tree_leaves
-from torch.utils.data import Dataset, Sampler
+from torch.utils.data import DataLoader, Dataset, Sampler, get_worker_info
 
 from meshspiral.data.cache import Arrays
 from meshspiral.data.prepared import Prepared, Recipe
@@ -21,7 +22,8 @@ KEPT = 2**29  # bytes of a split that stay in memory
 class MeshDataset(Dataset):
     """The tensors of one split. Item i is a dictionary, without a batch dimension.
 
-    Items are read when they are asked for. The first ones stay in memory, up to `KEPT` bytes. Item
+    Items are read when they are asked for. The first ones stay in memory, up to `KEPT` bytes, but
+    not in a reader process: each tensor that it has sent takes one of its few open files. Item
     i + e M, for M shapes and e > 0, is shape i in the version of epoch e, see `name_in`. What the
     cache lacks for it is computed when it is asked for.
 
@@ -73,7 +75,7 @@ class MeshDataset(Dataset):
         if item is None:
             item = self._recipe.read(self._prepared[i], self._tables)
             size = item_bytes(item)
-            if self.kept + size <= KEPT:
+            if self.kept + size <= KEPT and get_worker_info() is None:
                 self.kept += size
                 self._items[i] = item
         return {**item, "index": i}
@@ -126,6 +128,16 @@ class EpochSampler(Sampler[int]):
         skip, self.skip = self.skip, 0
         version = self.epoch * self.size if self.fresh else 0
         yield from (version + i for i in order[skip:])
+
+
+def end_readers(loader: weakref.ref[DataLoader]) -> None:
+    """End the readers of a loader; at exit, Python itself would wait for those that ignore SIGTERM.
+
+    Args:
+        loader: If it still exists.
+    """
+    if (found := loader()) is not None:
+        found._iterator = None
 
 
 def ignore_signals(reader: int) -> None:

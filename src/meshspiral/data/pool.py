@@ -42,7 +42,7 @@ def run_all(
         DataError: A worker process was killed.
     """
     order = list(range(len(items)))
-    random.Random(os.getpid()).shuffle(order)
+    random.Random().shuffle(order)
     cluster = _is_on_cluster()
     workers = effective_n_jobs(-1) if cluster else min(workers or cpu_count(), len(items))
     results: list[Any] = [None] * len(items)

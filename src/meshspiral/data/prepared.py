@@ -120,8 +120,13 @@ class Recipe:
                     )
         return found
 
-    def prepare(self, name: str) -> Prepared:
-        """Compute what the cache lacks for one shape. Raises what `prepare_all` does."""
+    def prepare(self, name: str, check: bool = False) -> Prepared:
+        """Compute what the cache lacks for one shape. Raises what `prepare_all` does.
+
+        Args:
+            name: The shape.
+            check: Whether what the cache has is read whole, and computed again if it is damaged.
+        """
         shape = self.shape(name)
         mesh, least = shape.mesh, self.neighbourhood.least_vertices
         if least > len(mesh.vertices):
@@ -132,16 +137,16 @@ class Recipe:
         described = [descriptor_task(mesh, each, self.half) for each in self.features.descriptors]
         table = neighbourhood_task(mesh, self.neighbourhood)
         frame = self.neighbourhood.frame and frame_task(mesh, self.neighbourhood.frame)
-        results = [load_task(t, self.cache, check=False) for t in described]
+        results = [load_task(t, self.cache, check) for t in described]
         for task in filter(None, (frame, table)):
-            load_task(task, self.cache, check=False)
+            load_task(task, self.cache, check)
         arrays = {"vertices": mesh.vertices, "faces": mesh.faces, "labels": shape.labels}
         arrays |= shape.points._asdict() if shape.points else {}
         arrays |= (
             {} if mesh.complete_area is None else {"complete_area": np.array(mesh.complete_area)}
         )
         key = digest(*(array for _, array in sorted(arrays.items())))
-        self.cache.get("shapes", key, lambda: arrays, check=False)
+        self.cache.get("shapes", key, lambda: arrays, check)
         return Prepared(
             name,
             len(mesh.vertices),
@@ -161,7 +166,7 @@ class Recipe:
         """
         found = self._load(prepared)
         if found is None:  # removed from the cache meanwhile, or damaged
-            found = self._load(self.prepare(prepared.name), check=True)
+            found = self._load(self.prepare(prepared.name, check=True))
         described, shape, arrays, frames = found
         if prepared.table in tables:
             arrays = tables[prepared.table] = tables[prepared.table] or arrays
@@ -201,7 +206,8 @@ class Recipe:
         modules += [mesh_files, meshes, preprocessing, shot]
         shapes: ShapeSet | None = self.shapes
         while shapes:  # the data set, and those that it changes
-            modules.append(inspect.getmodule(type(shapes)))
+            classes = [cls for cls in type(shapes).__mro__ if issubclass(cls, ShapeSet)]
+            modules += map(inspect.getmodule, classes)
             shapes = shapes.base
         key = digest(
             template.vertices,

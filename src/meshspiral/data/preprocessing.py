@@ -69,7 +69,8 @@ def _descriptor_key(mesh: Mesh, descriptor: Descriptor, *more: str) -> str:
 
 def neighbourhood_task(mesh: Mesh, neighbourhood: Neighbourhood) -> Task:
     """The arrays of a neighbourhood, see its `compute`."""
-    version = code_version(*neighbourhood.modules, *sources(neighbourhood), meshes)
+    modules = (*neighbourhood.modules, *sources(neighbourhood), meshes, sys.modules[__name__])
+    version = code_version(*modules)
     settings = sorted(neighbourhood.settings.model_dump().items())
     key = digest(repr(settings), *neighbourhood.mesh_key(mesh), version)
     inputs = _inputs(neighbourhood, mesh)

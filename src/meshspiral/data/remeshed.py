@@ -16,7 +16,7 @@ from meshspiral.geometry.barycentric import interpolate
 from meshspiral.geometry.digest import derived_seed, digest
 from meshspiral.geometry.mesh import Mesh, used_vertices
 
-FUSING = ("fused", "scans")  # policies that may join parts which are apart in another shape
+FUSING = ("fused", "scans")  # policies that join parts which are apart in another shape
 TEAR = 4.0  # growth at which a face tears; that of skin is mostly below
 
 
@@ -86,14 +86,14 @@ class Remeshed(ShapeSet):
         source = self.source(name)
         pattern, task = self._tessellation(name)
         arrays = load_task(task, self._cache)
+        if pattern is not None and not np.array_equal(pattern.mesh.faces, source.mesh.faces):
+            raise DataError(
+                f"{name}: the faces are not those of {pattern.mesh.name}; data.remesh.shared "
+                "needs shapes with the same faces"
+            )
         corners, weights = source.mesh.faces[arrays["face"]], arrays["weights"]
         vertices, faces = arrays["vertices"], arrays["faces"]
         if pattern is not None:
-            if not np.array_equal(pattern.mesh.faces, source.mesh.faces):
-                raise DataError(
-                    f"{name}: the faces are not those of {pattern.mesh.name}; data.remesh.shared "
-                    "needs shapes with the same faces"
-                )
             before, vertices = vertices, interpolate(source.mesh.vertices, corners, weights)
             if self._policy in FUSING:
                 used, faces = used_vertices(faces[~torn(before, vertices, faces)])

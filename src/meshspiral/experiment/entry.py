@@ -204,6 +204,8 @@ def one_line(error: BaseException) -> str:
         return lines[0] + reason
     if type(error).__module__ == "builtins" and isinstance(error, OSError) and error.filename:
         return f"{error.filename}: {error.strerror}"
+    if from_reader := re.match(r"Caught (\w+) in DataLoader worker", text := str(error)):
+        return text.rpartition(f"{from_reader[1]}: ")[2].strip()  # the traceback is above it
     return str(error)
 
 

@@ -26,8 +26,8 @@ def check_checkpoint(checkpoint: Path, config: TrainConfig, processes: int) -> d
         Its content.
 
     Raises:
-        RunError: It is damaged, of another network, of a run in another number of processes, whose
-            epochs have another number of steps, or of a later epoch than the config has.
+        RunError: It is damaged, of another network, of a run in another number of processes or with
+            another `trainer.accumulate`, or of a later epoch than the config has.
     """
     try:
         saved = read_checkpoint(checkpoint)

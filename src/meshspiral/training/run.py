@@ -68,6 +68,7 @@ def train(config: TrainConfig, folder: Path) -> dict[str, float]:
         if (folder / BEST).exists():
             check_checkpoint(folder / BEST, config, trainer.world_size)
         saved = check_checkpoint(last, config, trainer.world_size)
+        data.check_checkpoint(saved)
         meshes = math.ceil(len(data.datasets["train"]) / trainer.world_size)
         steps = math.ceil(meshes / config.trainer.accumulate)
         progress = Progress.of(saved, config, steps)

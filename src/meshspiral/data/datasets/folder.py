@@ -36,7 +36,8 @@ Files = Annotated[Any, BeforeValidator(_files)]
 class Folder(ShapeSet, name="folder"):
     """Meshes in a folder, each with a file of labels: the template vertices of its vertices.
 
-    The name of a shape is its path relative to `root`, without suffix and with "_" for "/".
+    The name of a shape is its path relative to `root`, without suffix and with "_" for "/", and for
+    "@" and "~", which mark versions of a shape.
 
     Args:
         root: The folder.
@@ -99,6 +100,7 @@ class Folder(ShapeSet, name="folder"):
                         f"{mesh} is in {other} and in {split}; a mesh must be in one split only"
                     )
                 name = "_".join(mesh.relative_to(root).with_suffix("").parts)
+                name = name.replace("@", "_").replace("~", "_")
                 if name in self._meshes:
                     raise DataError(f"{self._meshes[name]} and {mesh} would both be named {name}")
                 self._meshes[name] = mesh
@@ -184,7 +186,7 @@ def _label_file(root: Path, mesh: Path, labels: str | None) -> Path | None:
 
 def _lines(path: Path) -> list[str]:
     try:
-        lines = path.read_text(encoding="utf-8").splitlines()
+        lines = path.read_text(encoding="utf-8-sig").splitlines()
     except (OSError, UnicodeDecodeError) as error:
         raise DataError(f"{path}: cannot read the list of meshes ({error})") from error
     return [line.strip() for line in lines if line.strip()]
