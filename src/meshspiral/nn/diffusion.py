@@ -7,6 +7,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, nn
 
+from meshspiral.nn.dropout import Dropout
 from meshspiral.nn.geodesic import Resampling, resample
 
 LEAST_TIME = 1e-8
@@ -106,10 +107,10 @@ class DiffusionBlock(nn.Module):
         self.perceptron = nn.Sequential(
             nn.Linear(3 * channels, channels),
             nn.ReLU(),
-            nn.Dropout(dropout),
+            Dropout(dropout),
             nn.Linear(channels, channels),
             nn.ReLU(),
-            nn.Dropout(dropout),
+            Dropout(dropout),
             nn.Linear(channels, channels),
         )
 

@@ -9,6 +9,7 @@ import torch
 from pydantic import Field, field_validator
 from torch import Tensor, nn
 
+from meshspiral.nn.dropout import Dropout
 from meshspiral.nn.layers import dense
 from meshspiral.nn.networks.base import Network
 
@@ -64,7 +65,7 @@ class ThreeLayerNet(Network):
         )
         self.neck = dense(channels[-1], LAST)
         self.head = dense(LAST, num_classes)
-        self.dropout = nn.Dropout(dropout)
+        self.dropout = Dropout(dropout)
 
     def layer(self, i: int, in_features: int, out_features: int) -> nn.Module:
         """The i-th of the three layers."""
