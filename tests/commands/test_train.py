@@ -531,9 +531,10 @@ LEARN = ["optim.epochs=60", "optim.lr=0.01", "model.dropout=0.1", "trainer.val_e
 
 
 def test_a_network_learns_independently_of_the_numbering(toy_overrides, tmp_path):
-    """The metrics with every mesh randomly renumbered agree within noise."""
-    original = run(tmp_path / "original", [*toy_overrides, *LEARN])
-    shuffled = run(tmp_path / "shuffled", [*toy_overrides, *LEARN, "data.shuffle_vertices=true"])
+    """The metrics with every mesh randomly renumbered agree within noise, least without dropout."""
+    words = [*toy_overrides, *LEARN, "model.dropout=0"]
+    original = run(tmp_path / "original", words)
+    shuffled = run(tmp_path / "shuffled", [*words, "data.shuffle_vertices=true"])
     assert original["test/exact_match"] > 0.6  # chance: 0.006
     assert shuffled["test/exact_match"] == pytest.approx(original["test/exact_match"], abs=0.12)
     assert shuffled["test/geodesic_error"] == pytest.approx(
