@@ -23,7 +23,7 @@ def test_confidences_are_those_of_the_divided_scores(trained):
     config = config_of(saved)
     found = {}
     for temperature in (1.0, 3.0):
-        matcher = Matcher({**saved, "temperature": temperature}, config)
+        matcher = Matcher({**saved, "temperature": temperature}, config, unflip=False)
         found[temperature] = matcher.predict(source)
     (plain, one), (cooled, _) = found[1.0], found[3.0]
     np.testing.assert_array_equal(plain.template, cooled.template)

@@ -140,7 +140,7 @@ def test_an_init_that_is_no_run_is_a_one_line_error(cli, toy_overrides, tmp_path
 
 
 def test_bundled_is_the_network_of_the_matcher(toy_overrides, template):
-    size = ["model.channels=[100,150,200]", "data.shot.bins=16"]
+    size = ["model.channels=[150,225,300]", "data.shot.bins=16"]
     config = composed([*toy_overrides, *size, "variant=matcher", "init=bundled"])
     module = Correspondence(config.model_dump(), 544, 162)
     [first, *_] = InitialWeights(config, 544).load_into(module, template)
