@@ -15,5 +15,6 @@ def trained(tmp_path_factory, toy_overrides) -> Path:
     folder = tmp_path_factory.mktemp("trained")
     gcnn3 = [o for o in toy_overrides if not o.startswith("seq_len")]
     settings = ["model=gcnn3", "optim.epochs=30", "optim.lr=0.01", "data.shot.radius=0.5"]
+    settings += ["model.dropout=0.1"]
     run(folder, [*gcnn3, *settings])
     return folder

@@ -13,8 +13,8 @@ from typing import NamedTuple
 
 import numpy as np
 import trimesh
-from scipy.spatial import cKDTree
 
+from meshspiral.geometry.kdtree import kd_tree
 from meshspiral.geometry.mesh import Mesh, MeshError
 
 FUSED = (0.006, 0.012)  # half the width of gaps that "fused" closes, over the size of the mesh
@@ -115,7 +115,7 @@ def closest_points(
     directions = mesh.face_normals / np.maximum(
         np.linalg.norm(mesh.face_normals, axis=1, keepdims=True), 1e-300
     )
-    tree = cKDTree(centres)
+    tree = kd_tree(centres)
     count = len(points)
     face, closest = np.zeros(count, dtype=np.int64), np.zeros((count, 3))
     distance = np.full(count, np.inf)
@@ -168,7 +168,7 @@ def bending(mesh: Mesh, radius: float) -> np.ndarray:
     """
     radius = max(radius, 2 * equilateral_edge(mesh.area, len(mesh.vertices)))
     normals = np.nan_to_num(mesh.vertex_normals)
-    one, other = cKDTree(mesh.vertices).query_pairs(radius, output_type="ndarray").T
+    one, other = kd_tree(mesh.vertices).query_pairs(radius, output_type="ndarray").T
     agree = np.einsum("px,px->p", normals[one], normals[other]) > 0
     one, other = one[agree], other[agree]
     total, count = normals.copy(), np.ones(len(normals))
@@ -298,7 +298,7 @@ class Tool:
             share: The share of the surface area to select.
         """
         points, faces = self.result()
-        bent = bent[cKDTree(self.source.vertices).query(points)[1]]
+        bent = bent[kd_tree(self.source.vertices).query(points)[1]]
         order = np.argsort(-bent[faces].mean(axis=1))
         area = np.cumsum(trimesh.triangles.area(points[faces[order]]))
         last = order[np.searchsorted(area, share * area[-1])]

@@ -7,8 +7,8 @@ correspondence" (2019).
 from __future__ import annotations
 
 import numpy as np
-from scipy.spatial import cKDTree
 
+from meshspiral.geometry.kdtree import kd_tree
 from meshspiral.geometry.laplacian import spectrum
 from meshspiral.geometry.mesh import Mesh, MeshError
 
@@ -56,5 +56,5 @@ def zoomout(
     for count in range(FROM, TO + 1, STEP):
         basis = functions[:, :count]
         functional_map = (basis.T * masses) @ others[match, :count]
-        _, match = cKDTree(others[:, :count] @ functional_map.T).query(basis)
+        _, match = kd_tree(others[:, :count] @ functional_map.T).query(basis)
     return match

@@ -9,10 +9,10 @@ the arm are replaced by their mirror images.
 from __future__ import annotations
 
 import numpy as np
-from scipy.spatial import cKDTree
 from trimesh.graph import connected_component_labels
 
 from meshspiral.geometry.faces import directed_edges
+from meshspiral.geometry.kdtree import kd_tree
 from meshspiral.geometry.mesh import Mesh
 
 JUMP = 0.1  # over sqrt(area) of the template: the least distance of labels that jump
@@ -32,7 +32,7 @@ def mirror_images(template: Mesh, up: str) -> np.ndarray | None:
         int64 [K]; None if the images are on average further than ASYMMETRY from a vertex.
     """
     vertices = template.vertices / template.size
-    tree, found = cKDTree(vertices), []
+    tree, found = kd_tree(vertices), []
     for axis in {0, 1, 2} - {"xyz".index(up)}:
         images = vertices.copy()
         images[:, axis] = vertices[:, axis].min() + vertices[:, axis].max() - images[:, axis]

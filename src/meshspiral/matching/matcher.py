@@ -16,7 +16,6 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 from scipy.sparse import csr_array
-from scipy.spatial import cKDTree
 
 from meshspiral.data.descriptors import Features
 from meshspiral.data.preprocessing import compute_task, descriptor_task, neighbourhood_task
@@ -25,6 +24,7 @@ from meshspiral.data.tensors import described_tensors, neighbourhood_tensors
 from meshspiral.experiment.run_folder import BEST
 from meshspiral.experiment.schema import TrainConfig
 from meshspiral.geometry.holes import has_large_holes
+from meshspiral.geometry.kdtree import kd_tree
 from meshspiral.geometry.mesh import Mesh
 from meshspiral.geometry.resample import resample, resampled
 from meshspiral.geometry.zoomout import TO, eigenfunctions, zoomout
@@ -404,7 +404,7 @@ class Matcher:
 
     def _nearest_vertices(self, points: np.ndarray) -> np.ndarray:
         """The template vertex nearest to each point, int64 [V]."""
-        return cKDTree(self.template.vertices).query(points)[1]
+        return kd_tree(self.template.vertices).query(points)[1]
 
     @cached_property
     def _spread(self) -> csr_array:
@@ -449,7 +449,7 @@ def nearest_vertices(source: Labels, target: Labels) -> np.ndarray:
     points, first = np.unique(target.points[labelled], axis=0, return_index=True)
     known = source.template >= 0
     if len(labelled) and known.any():
-        _, nearest = cKDTree(points).query(source.points[known])
+        _, nearest = kd_tree(points).query(source.points[known])
         match[known] = labelled[first[nearest]]
     return match
 

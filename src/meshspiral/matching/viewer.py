@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 from plotly.offline import get_plotlyjs
-from scipy.spatial import cKDTree
 
+from meshspiral.geometry.kdtree import kd_tree
 from meshspiral.geometry.mesh import Mesh
 from meshspiral.geometry.resample import resampled
 from meshspiral.matching.job import FileMatch, LabelledScan
@@ -49,7 +49,7 @@ class Side:
         shown = np.arange(len(mesh.vertices))
         if len(mesh.vertices) > MOST_VERTICES:
             thin = resampled(mesh, MOST_VERTICES)
-            _, shown = cKDTree(mesh.vertices).query(thin.vertices)
+            _, shown = kd_tree(mesh.vertices).query(thin.vertices)
             mesh = thin
         self.mesh, self.origin = mesh, origin[shown]
         self.confidence, self.points = confidence[shown], points[shown]
@@ -169,7 +169,7 @@ def _counterparts(side: Side, other: Side, size: float) -> tuple[np.ndarray, np.
     known = np.isfinite(side.points).all(axis=1)
     others = np.flatnonzero(np.isfinite(other.points).all(axis=1))
     if known.any() and len(others):
-        distance, nearest = cKDTree(other.points[others]).query(side.points[known])
+        distance, nearest = kd_tree(other.points[others]).query(side.points[known])
         counterpart[known], apart[known] = others[nearest], distance / size
     return counterpart, apart
 
