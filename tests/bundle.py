@@ -3,7 +3,8 @@
     python -m tests.bundle <run_folder>
 
 Copies what `match` and `init=bundled` read, without the state of the optimizer and without what
-belongs to one machine. `match` computes in float32, so that a map is the same everywhere.
+belongs to one machine. Weights are stored in float16, in half the space. `match` computes in
+float32, so that a map is the same everywhere.
 """
 
 from __future__ import annotations
@@ -52,6 +53,7 @@ def main() -> None:
     saved = read_checkpoint(run / BEST)
     config = of_any_machine(config_of(saved, str(run)))
     kept = {key: saved[key] for key in KEPT}
+    kept["state_dict"] = {key: value.half() for key, value in saved["state_dict"].items()}
     kept["hyper_parameters"] = saved["hyper_parameters"] | {"config": config.model_dump()}
     torch.save(kept, bundled / BEST)
     write_config(bundled, of_any_machine(read_run_config(run)))

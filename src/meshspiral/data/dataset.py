@@ -136,8 +136,8 @@ def end_readers(loader: weakref.ref[DataLoader]) -> None:
     Args:
         loader: If it still exists.
     """
-    if (found := loader()) is not None:
-        found._iterator = None
+    for reader in getattr(getattr(loader(), "_iterator", None), "_workers", ()):
+        reader.kill()
 
 
 def ignore_signals(reader: int) -> None:
