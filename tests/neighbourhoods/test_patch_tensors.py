@@ -63,13 +63,13 @@ def test_a_sample_that_left_the_surface_has_no_entries():
     mesh = lattice(4, 5)
     arrays = patch().compute(mesh)
     turn = first_directions(mesh)
-    whole = geodesic_patches(mesh, 0.1 * diameter(mesh), 3, 8, turn).exists.transpose(0, 2, 1)
-    assert 0 < whole.mean() < 1
-    np.testing.assert_array_equal(np.diff(arrays["first"]), 3 * whole.ravel())
+    exists = geodesic_patches(mesh, 0.1 * diameter(mesh), 3, 8, turn).exists.transpose(0, 2, 1)
+    assert 0 < exists.mean() < 1
+    np.testing.assert_array_equal(np.diff(arrays["first"]), 3 * exists.ravel())
     patches = by_rows_and_columns(arrays, 20)
     by_rows, by_columns = dense_samples(patches, 3, 8)
     np.testing.assert_array_equal(by_columns, by_rows)
-    np.testing.assert_allclose(by_rows.sum(3), whole, atol=1e-6)
+    np.testing.assert_allclose(by_rows.sum(3), exists, atol=1e-6)
 
 
 @pytest.mark.parametrize("width", [2.0, 0.2])

@@ -142,7 +142,8 @@ def match_many(config: MatchConfig) -> Path:
         result.repaired,
         len(result.refused),
     )
-    for name in (refused := [name for name in sources if sources[name] in result.refused]):
+    refused = [name for name, path in sources.items() if path in result.refused]
+    for name in refused:
         delete_match(folder / name, sources[name])  # of an earlier content of the file
     write_index(folder, sources.keys() - refused, result.refused.values())
     log.info("All of them: %s", folder / INDEX)

@@ -53,8 +53,8 @@ class CorrespondenceData(L.LightningDataModule):
         workers: Number of processes that compute what is not cached; None for one per core.
         half: Keep descriptors as float16 in the cache.
         readers: Number of processes that read meshes ahead of the steps; None for one if the
-            meshes do not fit into `KEPT` bytes of memory, else none. With `fresh`, one per core but
-            one for each process that trains, and at least one.
+            meshes do not fit into `KEPT` bytes of memory, else none. With `fresh`, so many that
+            each process that trains keeps one core for itself, and at least one.
         fresh: Train each epoch on other versions of the shapes. Readers make them ahead of the
             steps of the epoch, and they are cached.
 

@@ -23,7 +23,7 @@ class MeshDataset(Dataset):
     """The tensors of one split. Item i is a dictionary, without a batch dimension.
 
     Items are read when they are asked for. The first ones stay in memory, up to `KEPT` bytes, but
-    not in a reader process: each tensor that it has sent takes one of its few open files. Item
+    not in a reader process: for each tensor that it sent and keeps, it holds a file open. Item
     i + e M, for M shapes and e > 0, is shape i in the version of epoch e, see `name_in`. What the
     cache lacks for it is computed when it is asked for.
 

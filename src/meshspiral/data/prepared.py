@@ -142,9 +142,8 @@ class Recipe:
             load_task(task, self.cache, check)
         arrays = {"vertices": mesh.vertices, "faces": mesh.faces, "labels": shape.labels}
         arrays |= shape.points._asdict() if shape.points else {}
-        arrays |= (
-            {} if mesh.complete_area is None else {"complete_area": np.array(mesh.complete_area)}
-        )
+        if mesh.complete_area is not None:
+            arrays["complete_area"] = np.array(mesh.complete_area)
         key = digest(*(array for _, array in sorted(arrays.items())))
         self.cache.get("shapes", key, lambda: arrays, check)
         return Prepared(

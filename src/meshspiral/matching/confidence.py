@@ -97,24 +97,28 @@ def near_confidence(found: Distributions, template: np.ndarray, near: csr_array)
     Returns:
         float32 [V]; 0 without a label.
     """
-    known = (template >= 0) & (found.row_of >= 0)
-    pairs = np.stack([found.row_of[known], template[known]], axis=1)
 
     def probability(rows: np.ndarray, labels: np.ndarray) -> np.ndarray:
         return near[labels].multiply(found.rows(rows)).sum(axis=1)
 
-    return _of_pairs(known, pairs, probability)
+    return _of_labels(found, template, probability)
 
 
 def label_confidence(found: Distributions, template: np.ndarray) -> np.ndarray:
-    """The predicted probability of each label, float32 [V]; 0 without one. Arguments as above."""
-    known = (template >= 0) & (found.row_of >= 0)
-    pairs = np.stack([found.row_of[known], template[known]], axis=1)
+    """The predicted probability of each label.
+
+    Args:
+        found: Of V vertices.
+        template: int [V], their labels; -1 for none.
+
+    Returns:
+        float32 [V]; 0 without a label.
+    """
 
     def probability(rows: np.ndarray, labels: np.ndarray) -> np.ndarray:
         return found.rows(rows)[np.arange(len(rows)), labels]
 
-    return _of_pairs(known, pairs, probability)
+    return _of_labels(found, template, probability)
 
 
 def soft_points(
@@ -169,6 +173,13 @@ def map_confidence(
         others, of_other = np.unique(others, return_inverse=True)
         return np.einsum("pk,pk->p", around[of_row], target.rows(others)[of_other])
 
+    return _of_pairs(known, pairs, probability)
+
+
+def _of_labels(found: Distributions, template: np.ndarray, probability) -> np.ndarray:
+    """`_of_pairs` of the rows of `found` and the labels, where a vertex has both."""
+    known = (template >= 0) & (found.row_of >= 0)
+    pairs = np.stack([found.row_of[known], template[known]], axis=1)
     return _of_pairs(known, pairs, probability)
 
 

@@ -22,8 +22,17 @@ from meshspiral.training.checkpoints import BUNDLED_RUN
 
 CONTENT = "sides"  # part of the key: earlier versions wrote other labels, so it is done anew
 # settings that change no match, and those whose files are in the key
-NOT_IN_KEY = {"source", "sources", "target", "run", "output", "picture", "accelerator"}
-NOT_IN_KEY |= {"workers", "plugins"}
+NOT_IN_KEY = {
+    "source",
+    "sources",
+    "target",
+    "run",
+    "output",
+    "picture",
+    "accelerator",
+    "workers",
+    "plugins",
+}
 STAGES = ("reading", *MESH_STAGES)  # of a mesh file
 FileReport = Callable[[str, str], None]  # is told "source" or "target", and a stage that begins
 

@@ -233,12 +233,8 @@ class Matcher:
         template, points, flipped, row_of = (
             values[scan.vertex_of] for values in (template, points, flipped, nearest)
         )
-        template[missing], points[missing], flipped[missing], row_of[missing] = (
-            -1,
-            np.nan,
-            False,
-            -1,
-        )
+        template[missing], row_of[missing] = -1, -1
+        points[missing], flipped[missing] = np.nan, False
         found = found._replace(row_of=row_of)
         confidence = label_confidence(found, template)
         around = near_confidence(found, template, self._near_vertices)

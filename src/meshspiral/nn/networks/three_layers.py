@@ -36,7 +36,6 @@ class ThreeLayerNet(Network):
         dropout: float = Field(
             ge=0, lt=1, description="dropout after the first dense layer and before the last"
         )
-
         lifted: int = Field(
             LIFTED, ge=1, description="channels after the first dense layer (paper: 16)"
         )
