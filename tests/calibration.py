@@ -23,8 +23,8 @@ from meshspiral import Matcher, Mesh, scan
 from meshspiral.data.datasets.bodies import Bodies
 from meshspiral.data.reference import ReferenceDistances
 from meshspiral.data.remeshed import Remeshed
-from meshspiral.data.shapes import Shape
-from meshspiral.evaluation.metrics import geodesic_errors, point_errors
+from meshspiral.data.shapes import Shape, SurfacePoints
+from meshspiral.evaluation.metrics import at_vertices, geodesic_errors, point_errors
 from meshspiral.evaluation.outcome import evenly
 from meshspiral.matching.confidence import RADIUS
 from meshspiral.matching.matcher import nearest_vertices
@@ -116,8 +116,8 @@ def errors(
     predicted = predicted.astype(np.int64)
     if shape.points is None:
         return geodesic_errors(predicted, shape.labels[known], reference)
-    true_points = (array[known] for array in shape.points)
-    return point_errors(predicted, *true_points, reference, reference.place)
+    true = SurfacePoints(*(array[known] for array in shape.points))
+    return point_errors(at_vertices(predicted), true, reference, reference.place)
 
 
 def bin_texts(confidence: np.ndarray, right: np.ndarray) -> list[str]:

@@ -14,7 +14,7 @@ import numpy as np
 from meshspiral.data.cache import Cache
 from meshspiral.data.reference import ReferenceDistances
 from meshspiral.data.sources import open_shapes
-from meshspiral.evaluation.metrics import point_errors
+from meshspiral.evaluation.metrics import at_vertices, point_errors
 from tests.helpers import composed
 
 
@@ -26,7 +26,8 @@ def main() -> None:
         reference = ReferenceDistances(shapes.template, Cache(data.cache_dir))
         errors = []
         for shape in map(shapes.load, shapes.names["test"]):
-            errors.append(point_errors(shape.labels, *shape.points, reference, reference.place))
+            labels = at_vertices(shape.labels)
+            errors.append(point_errors(labels, shape.points, reference, reference.place))
         print(f"{name}: {np.concatenate(errors).mean():.4f}")
 
 

@@ -17,11 +17,14 @@ from meshspiral.data.descriptors import Features
 from meshspiral.data.descriptors.shot import Shot
 from meshspiral.data.settings import ShotSettings
 from meshspiral.data.shapes import DataError, Shape, ShapeSet, SurfacePoints
-from meshspiral.evaluation.metrics import THRESHOLDS, point_errors
+from meshspiral.evaluation import retest
+from meshspiral.evaluation.distributions import Distributions
+from meshspiral.evaluation.metrics import THRESHOLDS, at_vertices, point_errors
 from meshspiral.evaluation.outcome import Outcome, Result, evenly, result_of, rotations
 from meshspiral.evaluation.retest import config_on_data
 from meshspiral.experiment.run_folder import BEST, CONFIG, ERRORS, METRICS, RunError
 from meshspiral.experiment.schema import ConfigError
+from meshspiral.geometry.barycentric import interpolate
 from meshspiral.training.checkpoints import template_of
 from tests.conftest import toy_shapes
 from tests.helpers import composed, run
@@ -348,12 +351,64 @@ def test_the_distance_to_a_point_is_interpolated_from_those_to_its_corners(tmp_p
     predicted = np.full(50, 160)
     at_predicted = (corners == 160).any(axis=1)
     to_corners = np.stack([reference(corner, predicted) for corner in corners.T], axis=1)
-    error = point_errors(predicted, corners, np.full((50, 3), 1 / 3), reference, reference.place)
+    centres = SurfacePoints(corners, np.full((50, 3), 1 / 3))
+    error = point_errors(at_vertices(predicted), centres, reference, reference.place)
     np.testing.assert_allclose(error[~at_predicted], to_corners[~at_predicted].mean(axis=1))
-    at_corner = point_errors(
-        predicted, corners, np.eye(3)[np.zeros(50, int)], reference, reference.place
-    )
+    first = at_vertices(corners[:, 0])
+    at_corner = point_errors(at_vertices(predicted), first, reference, reference.place)
     np.testing.assert_allclose(at_corner[~at_predicted], to_corners[~at_predicted, 0], rtol=1e-6)
+
+
+def test_points_are_measured_from_both_sides():
+    """As predictions and as true points; straight where their faces touch."""
+    template, rng = LabelledWithPoints().template, np.random.default_rng(0)
+    faces, place = template.faces, template.vertices
+
+    def distances(sources, targets):
+        return np.linalg.norm(place[sources] - place[targets], axis=1)
+
+    some, others = (
+        SurfacePoints(faces[rng.permutation(200)], rng.dirichlet(np.ones(3), 200)) for _ in range(2)
+    )
+    forth = point_errors(some, others, distances, place)
+    np.testing.assert_allclose(forth, point_errors(others, some, distances, place))
+    touch = np.array([bool({*a} & {*b}) for a, b in zip(some.corners, others.corners, strict=True)])
+    ends = (interpolate(place, *points) for points in (some, others))
+    straight = np.linalg.norm(next(ends) - next(ends), axis=1)
+    assert 0 < touch.sum() < 200
+    np.testing.assert_allclose(forth[touch], straight[touch])
+    assert (forth[~touch] > straight[~touch]).all()
+    assert (point_errors(some, some, distances, place) == 0).all()
+
+
+def test_a_prediction_shared_by_three_vertices_is_a_point_within_their_face(tmp_path, monkeypatch):
+    monkeypatch.setattr(retest, "SPREAD", 0.2)  # of this coarse template, all corners of a face
+    data = point_data(tmp_path)
+    data.prepare(["test"])
+    item, distances = data.datasets["test"][0], data.reference
+    corners, weights = item["corners"].numpy(), item["weights"].numpy()
+    probabilities = np.full((162, 162), 1e-12)
+    np.put_along_axis(probabilities, corners, weights, axis=1)
+    found = Distributions(
+        torch.from_numpy(np.log(probabilities)),
+        torch.eye(162, dtype=torch.float64),
+        torch.zeros(162, dtype=torch.float64),
+        np.arange(162),
+    )
+    labels = item["labels"].numpy()
+    outcome = Outcome.of(["c"], [item], {0: result_of(labels, item, distances)}, distances.diameter)
+    errors = retest.evaluate_points(lambda batch, purpose: found, data, outcome)
+    assert errors.max() < 1e-4 < outcome.errors.min()
+
+
+def test_points_are_evaluated_beside_vertices(cli, moved):
+    folder, metrics = moved
+    code, out, err = cli(f"run={folder}", "points=true", "shapes=0", program=main)
+    assert code == 0, err
+    found = json.loads((folder / "evaluation" / "folder" / METRICS).read_text())
+    assert found["test/exact_match"] == pytest.approx(metrics["test/exact_match"])
+    assert found["points/geodesic_error"] > 0 and "points/exact_match" not in found
+    assert f"{found['points/geodesic_error']:.4f}" in out.split("Points within faces")[1]
 
 
 def test_points_must_be_on_the_template():

@@ -8,14 +8,8 @@ import torch
 
 from meshspiral import Matcher, Mesh, scan
 from meshspiral.data.datasets.bodies import Bodies
-from meshspiral.matching.confidence import (
-    RADIUS,
-    Distributions,
-    map_confidence,
-    near_confidence,
-    near_vertices,
-    soft_points,
-)
+from meshspiral.evaluation.distributions import Distributions, near_vertices, soft_points
+from meshspiral.matching.confidence import RADIUS, map_confidence, near_confidence
 from tests.meshes import lattice
 
 TEMPLATE = lattice(30, 40)
@@ -36,7 +30,7 @@ def one_hot(*vertices) -> np.ndarray:
     return np.eye(SIZE)[list(vertices)]
 
 
-NEAR = near_vertices(TEMPLATE)
+NEAR = near_vertices(TEMPLATE, RADIUS)
 
 
 def test_near_vertices_of_a_plane_are_those_in_a_circle():
@@ -44,7 +38,7 @@ def test_near_vertices_of_a_plane_are_those_in_a_circle():
     x, radius = mesh.vertices, RADIUS * np.sqrt(mesh.area)
     expected = np.linalg.norm(x[:, None] - x, axis=2) <= radius
     assert expected.sum(axis=1).max() == 19  # two rings
-    np.testing.assert_array_equal(near_vertices(mesh).toarray(), expected)
+    np.testing.assert_array_equal(near_vertices(mesh, RADIUS).toarray(), expected)
 
 
 def test_near_vertices_do_not_cross_a_gap():
@@ -56,7 +50,7 @@ def test_near_vertices_do_not_cross_a_gap():
     y = np.where(fold < rows // 2, fold, rows - 1 - fold)
     x[:, 0] -= 0.5 * fold
     x[:, 1], x[:, 2] = y, 0.1 * (fold >= rows // 2)
-    near = near_vertices(Mesh(x, sheet.faces)).toarray()
+    near = near_vertices(Mesh(x, sheet.faces), RADIUS).toarray()
     one, above = 0, (rows - 1) * columns
     straight = np.linalg.norm(x[one] - x[above]) / np.sqrt(Mesh(x, sheet.faces).area)
     assert straight < RADIUS and not near[one, above] and near[one, one]

@@ -13,10 +13,10 @@ from scipy.spatial.transform import Rotation
 from meshspiral import Matcher, scan
 from meshspiral.commands.match import main
 from meshspiral.data.datasets.bodies import Bodies
+from meshspiral.evaluation.distributions import Distributions
 from meshspiral.geometry.barycentric import interpolate
 from meshspiral.geometry.mesh import Mesh
 from meshspiral.matching import export
-from meshspiral.matching.confidence import Distributions
 from meshspiral.matching.dense import dense_map
 from meshspiral.matching.job import FileMatch, LabelledScan
 from meshspiral.matching.matcher import Labels

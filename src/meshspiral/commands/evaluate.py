@@ -53,6 +53,13 @@ def main(config: EvaluateConfig) -> None:
         log.info(line)
     draws = f", {config.votes} votes" if config.votes > 1 else ""
     log.info("Seconds:     %.2f per mesh%s", seconds, draws)
+    curves = {"test": curve}
+    if config.points:
+        errors = retest.evaluate_points(predict.distributions, data, outcome)
+        values, curves["points"] = retest.point_metrics(errors)
+        metrics |= json_ready(values, "points")
+        for line in retest.point_lines(values):
+            log.info(line)
     if config.rotations:
         found = retest.evaluate_rotations(predict, data, config.rotations)
         metrics |= json_ready(found.metrics(), "rotations")
@@ -60,7 +67,7 @@ def main(config: EvaluateConfig) -> None:
         for line in retest.rotation_lines(found):
             log.info(line)
     write_metrics(folder, metrics)
-    summary.write_plots(folder, {"test": curve}, outcome, data, chosen, retest.KINDS)
+    summary.write_plots(folder, curves, outcome, data, chosen, retest.KINDS)
     log.info("Written to:  %s", folder)
 
 

@@ -1,6 +1,6 @@
 """Geodesic errors of a correspondence, and their cumulative curve (Kim et al. 2011).
 
-An error is the geodesic distance on the template between the predicted and the true vertex, divided
+An error is the geodesic distance on the template between the predicted and the true point, divided
 by the square root of the template's area. The literature also divides by the geodesic diameter;
 metric names say which of the two is meant.
 """
@@ -13,6 +13,7 @@ import numpy as np
 import torch
 from torchmetrics import Metric
 
+from meshspiral.data.shapes import SurfacePoints
 from meshspiral.geometry.barycentric import interpolate
 
 THRESHOLDS = np.arange(201) / 1000  # of sqrt(area); 0 to 0.2, the range that Lim et al. 2018 plot
@@ -38,34 +39,38 @@ def geodesic_errors(
     return distances(labels, predicted)
 
 
+def at_vertices(vertices: np.ndarray) -> SurfacePoints:
+    """Vertices of the template, int64 [V], as points on it."""
+    return SurfacePoints(vertices[:, None], np.ones((len(vertices), 1)))
+
+
 def point_errors(
-    predicted: np.ndarray,
-    corners: np.ndarray,
-    weights: np.ndarray,
+    predicted: SurfacePoints,
+    true: SurfacePoints,
     distances: Callable[[np.ndarray, np.ndarray], np.ndarray],
     vertices: np.ndarray,
 ) -> np.ndarray:
-    """Geodesic distance of each predicted vertex from a point within a face of the template.
+    """Geodesic distances between points of the template: predicted ones, and the true ones.
 
-    If the predicted vertex is a corner of that face, this is the straight distance; otherwise it is
-    interpolated linearly from the distances of the corners.
+    If the faces of two points have a vertex in common, this is the straight distance; otherwise it
+    is interpolated linearly from the distances between their corners.
 
     Args:
-        predicted: Template vertices, int64 [V].
-        corners: Corners of the face of each point, int64 [V, 3].
-        weights: Barycentric coordinates of each point, float [V, 3].
+        predicted: V points within faces, or from `at_vertices`.
+        true: V points.
         distances: As for `geodesic_errors`.
         vertices: Positions of the template's vertices in the unit of `distances`, float [K, 3].
 
     Returns:
         float64 [V], in the unit of `distances`.
     """
-    error = np.zeros(len(predicted))
-    for corner, weight in zip(corners.T, weights.T, strict=True):
-        error += weight * distances(corner, predicted)
-    within = (corners == predicted[:, None]).any(axis=1)
-    point = interpolate(vertices, corners[within], weights[within])
-    error[within] = np.linalg.norm(point - vertices[predicted[within]], axis=1)
+    error = np.zeros(len(true.corners))
+    for corner, weight in zip(true.corners.T, true.weights.T, strict=True):
+        for other, share in zip(predicted.corners.T, predicted.weights.T, strict=True):
+            error += weight * share * distances(corner, other)
+    near = (predicted.corners[:, :, None] == true.corners[:, None]).any(axis=(1, 2))
+    ends = (interpolate(vertices, p.corners[near], p.weights[near]) for p in (predicted, true))
+    error[near] = np.linalg.norm(next(ends) - next(ends), axis=1)
     return error
 
 

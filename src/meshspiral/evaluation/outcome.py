@@ -11,7 +11,13 @@ import numpy as np
 
 from meshspiral.data.files import write_arrays
 from meshspiral.data.reference import ReferenceDistances
-from meshspiral.evaluation.metrics import CorrespondenceError, geodesic_errors, point_errors
+from meshspiral.data.shapes import SurfacePoints
+from meshspiral.evaluation.metrics import (
+    CorrespondenceError,
+    at_vertices,
+    geodesic_errors,
+    point_errors,
+)
 from meshspiral.experiment.run_folder import RunError
 from meshspiral.neighbourhoods.base import Batch
 
@@ -41,8 +47,15 @@ def result_of(predicted: np.ndarray, batch: Batch, distances: ReferenceDistances
     to_label = geodesic_errors(predicted, batch["labels"].cpu().numpy(), distances)
     if "corners" not in batch:
         return Result(predicted, to_label, to_label)
-    point = batch["corners"].cpu().numpy(), batch["weights"].cpu().numpy()
-    return Result(predicted, point_errors(predicted, *point, distances, distances.place), to_label)
+    errors = point_errors(at_vertices(predicted), true_points(batch), distances, distances.place)
+    return Result(predicted, errors, to_label)
+
+
+def true_points(batch: Batch) -> SurfacePoints:
+    """The true points of a mesh, an item of `MeshDataset`: its labels, if these are exact."""
+    if "corners" not in batch:
+        return at_vertices(batch["labels"].cpu().numpy())
+    return SurfacePoints(batch["corners"].cpu().numpy(), batch["weights"].cpu().numpy())
 
 
 @dataclass(frozen=True, eq=False)

@@ -13,9 +13,15 @@ from tqdm import tqdm
 
 from meshspiral.data.datamodule import CorrespondenceData
 from meshspiral.data.files import write_file
-from meshspiral.data.shapes import DataError
+from meshspiral.data.shapes import DataError, SurfacePoints
 from meshspiral.data.sources import open_data
-from meshspiral.evaluation.metrics import THRESHOLDS
+from meshspiral.evaluation.distributions import (
+    SPREAD,
+    Distributions,
+    near_vertices,
+    soft_points,
+)
+from meshspiral.evaluation.metrics import THRESHOLDS, CorrespondenceError, point_errors
 from meshspiral.evaluation.outcome import (
     Outcome,
     Result,
@@ -23,11 +29,13 @@ from meshspiral.evaluation.outcome import (
     evenly,
     result_of,
     rotations,
+    true_points,
 )
 from meshspiral.experiment.run_folder import RunError
 from meshspiral.experiment.schema import ConfigError, TrainConfig, read_stored_config
 from meshspiral.geometry.digest import digest
 from meshspiral.geometry.mesh import Mesh
+from meshspiral.geometry.remesh import closest_points
 from meshspiral.neighbourhoods import Neighbourhood
 from meshspiral.neighbourhoods.base import Batch
 from meshspiral.nn.loss import Prediction
@@ -40,7 +48,9 @@ PLOTS = (
     *(f"{plot}.{kind}" for plot in ("curve", "rotations") for kind in KINDS),
 )
 
-Predict = Callable[[Batch, str], Prediction]  # of a batch, for a purpose; see `Predictor`
+# Of a batch, for a purpose; see `Predictor`.
+Predict = Callable[[Batch, str], Prediction]
+PredictDistributions = Callable[[Batch, str], Distributions]
 
 
 def config_on_data(trained: TrainConfig, requested: dict[str, Any]) -> TrainConfig:
@@ -152,6 +162,35 @@ def evaluate_rotations(predict: Predict, data: CorrespondenceData, count: int) -
     return rotations(runs, [item["labels"].numpy() for item in items])
 
 
+def evaluate_points(
+    predict: PredictDistributions, data: CorrespondenceData, predicted: Outcome
+) -> np.ndarray:
+    """Predict points within faces instead of vertices, for all test shapes.
+
+    A point is the mean of the template's vertices around the predicted one, by their probabilities,
+    moved to the nearest point of the surface.
+
+    Args:
+        predict: With the network that predicted the outcome.
+        data: The data set.
+        predicted: From `evaluate`.
+
+    Returns:
+        Distances from the true points over sqrt(area), float64 [K], in the order of the outcome.
+    """
+    template, errors = data.shapes.template, []
+    near = near_vertices(template, SPREAD)
+    progress = tqdm(predicted.names, desc="Points", unit="mesh", leave=False, delay=1.0)
+    for batch, name in zip(data.datasets["test"], progress, strict=True):
+        labels = predicted.predicted[predicted.mesh(name)]
+        points = soft_points(predict(batch, "evaluation"), labels, near, template.vertices)
+        face, weights, _ = closest_points(template, points, np.full_like(points, np.nan))
+        found = SurfacePoints(template.faces[face], weights)
+        true = true_points(batch)
+        errors.append(point_errors(found, true, data.reference, data.reference.place))
+    return np.concatenate(errors)
+
+
 def predict_mesh(predict: Predict, data: CorrespondenceData, i: int, purpose: str) -> Result:
     """Prediction and errors of test mesh i; random neighbourhoods depend on the purpose."""
     batch = data.datasets["test"][i]
@@ -192,11 +231,30 @@ def create_folder(
     return folder
 
 
+def point_metrics(errors: np.ndarray) -> tuple[dict[str, float], np.ndarray]:
+    """Pool the errors of points: metrics for metrics.json, without "points/", and the curve."""
+    pooled = CorrespondenceError()
+    pooled.update(errors, errors == 0)
+    values = pooled.compute()
+    curve = values.pop("curve").numpy()
+    del values["exact_match"]  # a point hardly ever is the true one
+    return {name: float(value) for name, value in values.items()}, curve
+
+
 def write_rotations(folder: Path, found: Rotations) -> None:
     """Write the plot of all repetitions, rotations.<kind>."""
     figure = all_curves_figure(THRESHOLDS, found.curves)
     for kind in KINDS:
         write_file(folder / f"rotations.{kind}", encoded(figure, kind))
+
+
+def point_lines(metrics: dict[str, float]) -> list[str]:
+    """The metrics of points, for the log."""
+    return [
+        "Points within faces instead of vertices",
+        f"  within 0.05 sqrt(area)             {100 * metrics['within_0.05']:7.2f} %",
+        f"  mean geodesic error / sqrt(area)   {metrics['geodesic_error']:9.4f}",
+    ]
 
 
 def rotation_lines(found: Rotations) -> list[str]:

@@ -145,6 +145,10 @@ class EvaluateConfig(Strict):
         ge=0, description="100: that many more predictions, each with other random spirals"
     )
     votes: int = Field(ge=1, description="predict from the mean of so many draws of random spirals")
+    points: bool = Field(
+        description="predict points within faces of the template, too: the mean of the vertices "
+        "around the label, by their probabilities"
+    )
     shapes: int | list[str] = Field(description="test shapes to draw: how many, or their names")
     accelerator: Accelerator
     threads: Threads

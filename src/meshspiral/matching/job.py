@@ -12,11 +12,11 @@ import numpy as np
 
 from meshspiral.data.attributes import KINDS, read_attribute
 from meshspiral.data.scans import Scan, open_scan
+from meshspiral.evaluation.distributions import Distributions
 from meshspiral.experiment.run_folder import BEST
 from meshspiral.experiment.schema import MatchConfig, read_config
 from meshspiral.geometry.digest import digest
 from meshspiral.geometry.mesh import MeshError
-from meshspiral.matching.confidence import Distributions
 from meshspiral.matching.matcher import MESH_STAGES, Labels, Matcher, nearest_vertices
 from meshspiral.training.checkpoints import BUNDLED_RUN
 

@@ -21,6 +21,12 @@ from meshspiral.data.descriptors import Features
 from meshspiral.data.preprocessing import compute_task, descriptor_task, neighbourhood_task
 from meshspiral.data.scans import Scan
 from meshspiral.data.tensors import described_tensors, neighbourhood_tensors
+from meshspiral.evaluation.distributions import (
+    SPREAD,
+    Distributions,
+    near_vertices,
+    soft_points,
+)
 from meshspiral.experiment.run_folder import BEST
 from meshspiral.experiment.schema import TrainConfig
 from meshspiral.geometry.holes import has_large_holes
@@ -29,12 +35,10 @@ from meshspiral.geometry.mesh import Mesh
 from meshspiral.geometry.resample import resample, resampled
 from meshspiral.geometry.zoomout import TO, eigenfunctions, zoomout
 from meshspiral.matching.confidence import (
-    Distributions,
+    RADIUS,
     label_confidence,
     map_confidence,
     near_confidence,
-    near_vertices,
-    soft_points,
 )
 from meshspiral.matching.flips import mirror_images, sides_of, without_flips
 from meshspiral.matching.mean_field import MeanField, likeliest_near
@@ -53,7 +57,6 @@ MESH_STAGES = (
 )
 Report = Callable[[str], None]  # is told each stage when it begins; not every mesh has all
 FACTORS = (1.0, 1.1, 1.2, 1.3, 1.45, 1.6, 1.8, 2.1, 2.5)  # tried for the size of an open surface
-SPREAD = 0.07  # over sqrt(area): how far around a label its point is averaged
 NEAR = 5.0  # mean edges of the template; labels further apart are not interpolated
 # of an ensemble: vertices over those of a training mesh, and size over that of the mesh
 COPIES = ((0.72, 0.96), (1.0, 1.0), (1.38, 1.04))
@@ -420,7 +423,7 @@ class Matcher:
 
     @cached_property
     def _near_vertices(self) -> csr_array:
-        return near_vertices(self.template)
+        return near_vertices(self.template, RADIUS)
 
     @cached_property
     def _eigenfunctions(self) -> np.ndarray:

@@ -14,9 +14,9 @@ import numpy as np
 from scipy.sparse import csr_array, diags_array
 from scipy.special import softmax
 
+from meshspiral.evaluation.distributions import near_vertices
 from meshspiral.geometry.faces import directed_edges
 from meshspiral.geometry.mesh import Mesh
-from meshspiral.matching.confidence import near_vertices
 
 WIDTH = 0.04  # over sqrt(area) of the template
 REACH = 2.5  # widths, beyond which the potential is 0

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from meshspiral.data.tensors import draw
+from meshspiral.evaluation.distributions import Distributions
 from meshspiral.experiment.run_folder import RunError
 from meshspiral.experiment.schema import TrainConfig
 from meshspiral.neighbourhoods import Neighbourhood
@@ -61,9 +63,16 @@ class Predictor:
             batch: An item of `MeshDataset`, with or without labels.
             purpose: Random choices of the neighbourhoods depend on it and on the run's seed.
         """
+        return self.predict(self._embeddings(batch, purpose), batch.get("labels"))
+
+    def distributions(self, batch: Batch, purpose: str) -> Distributions:
+        """Predict a distribution over the template's vertices; arguments as above."""
+        mean = torch.stack(self._embeddings(batch, purpose)).mean(0)  # the last layer is linear
+        return Distributions(mean, *self.head, np.arange(len(mean)))
+
+    def _embeddings(self, batch: Batch, purpose: str) -> list[Tensor]:
         purposes = [(purpose,), *((purpose, "vote", k) for k in range(1, self.votes))]
-        embeddings = [self.embed(batch, *each) for each in purposes]
-        return self.predict(embeddings, batch.get("labels"))
+        return [self.embed(batch, *each) for each in purposes]
 
     def embed(self, batch: Batch, *purpose: int | str) -> Tensor:
         """The input of the last layer for each vertex of a mesh, float [V, C].
