@@ -82,8 +82,9 @@ def test_the_heat_kernel_is_a_normal_distribution_on_a_plane(tmp_path):
     assert own == weights[centre].max()
 
 
-def test_a_narrow_heat_kernel_is_the_vertex_itself(tmp_path):
+@pytest.mark.parametrize("width", [0, 1e-4])
+def test_a_narrow_heat_kernel_is_the_vertex_itself(tmp_path, width):
     mesh = union(bumpy_sphere(), Mesh([[0, 0, 0]], []))
-    vertices, weights = ReferenceDistances(mesh, Cache(tmp_path)).heat_kernel(1e-4)
+    vertices, weights = ReferenceDistances(mesh, Cache(tmp_path)).heat_kernel(width)
     np.testing.assert_array_equal(vertices[:, 0], np.arange(len(mesh.vertices)))
     np.testing.assert_array_equal(weights[:, 0], 1)

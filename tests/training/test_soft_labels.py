@@ -33,3 +33,5 @@ def test_soft_labels_reach_the_loss(toy_overrides, tmp_path, monkeypatch, remesh
     run(tmp_path / "hard", words)
     assert all(kernel is None for _, kernel in read)
     assert not same_weights(tmp_path / "soft", tmp_path / "hard")
+    run(tmp_path / "points", [*words, "optim.soft_labels=0"])
+    assert same_weights(tmp_path / "points", tmp_path / "hard") == (not remesh)

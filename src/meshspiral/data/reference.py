@@ -80,13 +80,15 @@ class ReferenceDistances:
         share of the area. Vertices beyond three widths are left out.
 
         Args:
-            width: Over sqrt(template area).
+            width: Over sqrt(template area). With 0 each vertex keeps all of its probability.
 
         Returns:
             Vertices, int64 [K, M], and their probabilities, float32 [K, M]. M is the largest number
             of vertices within three widths; a row with fewer ends with probabilities of 0.
         """
         count, areas = len(self.template.vertices), self.template.vertex_areas
+        if width == 0:
+            return np.arange(count)[:, None], np.ones((count, 1), np.float32)
         rows = []
         for block, found in self._all_blocks("Soft labels"):
             for v, distances in enumerate(found, start=block * BLOCK):

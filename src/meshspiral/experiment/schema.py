@@ -60,9 +60,10 @@ class OptimSettings(Strict):
     )
     warmup: float = Field(ge=0, description="share of all steps before the rate is largest")
     soft_labels: float | None = Field(
-        gt=0,
+        ge=0,
         description="width of a heat kernel that blurs the labels, over the square root of the "
-        "template's area; null: exact labels",
+        "template's area; 0: where the true point lies within a face, its three vertices; null: "
+        "one vertex",
     )
 
     @field_validator("betas")
