@@ -98,6 +98,18 @@ def test_entries_are_the_largest_of_their_row_in_order():
     assert (np.diff(all_.weights, axis=3) <= 0).all()
 
 
+def test_a_face_that_is_hardly_one_changes_no_kernel_far_away():
+    sphere = bumpy_sphere()
+    vertices = sphere.vertices.copy()
+    a, b, c = sphere.faces[0]
+    vertices[b] = (vertices[a] + vertices[c]) / 2 + [1e-15, 0, 0]
+    mesh = Mesh(vertices, sphere.faces)
+    assert np.linalg.norm(mesh.face_normals[0]) < 1e-15
+    stiffness = anisotropic_stiffness(mesh, directions(mesh), 0.4, 100.0).toarray()
+    values = np.linalg.eigvalsh(stiffness)
+    assert abs(values[0]) < 1e-6 and values[1] > 1e-3
+
+
 def test_isolated_vertices_have_no_kernel_and_flat_faces_are_borne():
     sphere = bumpy_sphere()
     vertices = np.concatenate([sphere.vertices, [[9.0, 9, 9]]])

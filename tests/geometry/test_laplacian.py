@@ -64,6 +64,28 @@ def test_isolated_vertices_and_flat_faces_are_borne():
     assert np.isfinite(found.functions).all() and np.isfinite(found.values).all()
 
 
+@pytest.mark.parametrize("unit", [1e-4, 1e4])
+def test_the_spectrum_does_not_depend_on_the_unit(unit):
+    sphere = bumpy_sphere(subdivisions=2)
+    vertices = sphere.vertices.copy()
+    a, b, c = sphere.faces[0]
+    vertices[b] = (vertices[a] + vertices[c]) / 2  # collinear, by rounding not quite
+    values = spectrum(Mesh(vertices, sphere.faces), 10).values
+    found = spectrum(Mesh(unit * vertices, sphere.faces), 10).values
+    np.testing.assert_allclose(found * unit**2, values, rtol=1e-5, atol=1e-6)
+    assert values[1] > 0.1
+
+
+@pytest.mark.parametrize("subdivisions", [2, 3])
+def test_isolated_vertices_change_nothing(subdivisions):
+    sphere = bumpy_sphere(subdivisions=subdivisions)
+    more = Mesh(np.concatenate([[[9.0, 9, 9]] * 3, sphere.vertices]), sphere.faces + 3)
+    found, expected = spectrum(more, 10), spectrum(sphere, 10)
+    np.testing.assert_allclose(found.values, expected.values, atol=1e-9)
+    np.testing.assert_allclose(np.abs(found.functions[3:]), np.abs(expected.functions), atol=1e-6)
+    assert not found.functions[:3].any()
+
+
 def test_a_surface_without_area_is_refused():
     line = Mesh(np.array([[0.0, 0, 0], [1, 0, 0], [2, 0, 0]]), np.array([[0, 1, 2]]), "line")
     with pytest.raises(MeshError, match="line: surface area must be above 0"):

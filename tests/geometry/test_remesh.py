@@ -14,6 +14,7 @@ from meshspiral.data.settings import RemeshSettings
 from meshspiral.geometry.barycentric import interpolate
 from meshspiral.geometry.mesh import Mesh, MeshError
 from meshspiral.geometry.remesh import (
+    CLOSED,
     MIXTURES,
     POLICIES,
     Tool,
@@ -111,8 +112,8 @@ def test_tori_and_open_surfaces_get_the_size_wanted(policy):
     hills = lattice(15, 15)
     heights = np.sin(hills.vertices[:, 0]) / 2
     hills = Mesh(hills.vertices + heights[:, None] * [0, 0, 1], hills.faces)
-    if policy == "fused":
-        with pytest.raises(MeshError, match="policy fused needs a closed surface"):
+    if policy in CLOSED:
+        with pytest.raises(MeshError, match=f"policy {policy} needs a closed surface"):
             remesh(hills, 100, policy)
         return
     made = remesh(hills, 100, policy, seed=1).mesh
@@ -172,6 +173,57 @@ def test_closest_points_agree_with_exhaustive_search(surface):
         each[unit @ normal < 0.2] = np.inf
         assert far == pytest.approx(each.min()) and each[found] == pytest.approx(far)
         np.testing.assert_allclose(weight @ triangles[found], every[found], atol=1e-9)
+
+
+@pytest.mark.parametrize("unit", [1e-4, 1e4])
+def test_closest_points_do_not_depend_on_the_unit(surface, unit):
+    rng = np.random.default_rng(0)
+    points = surface.vertices[:100] + rng.normal(scale=0.02, size=(100, 3))
+    anything = np.full_like(points, np.nan)
+    face, weights, distance = closest_points(surface, points, anything)
+    scaled = Mesh(unit * surface.vertices, surface.faces)
+    found = closest_points(scaled, unit * points, anything)
+    one, other = (
+        interpolate(surface.vertices, surface.faces[f], w) for f, w in ((face, weights), found[:2])
+    )
+    np.testing.assert_allclose(other, one, atol=1e-9)
+    np.testing.assert_allclose(found[2], unit * distance, rtol=1e-9)
+
+
+def test_points_on_collinear_faces_have_coordinates_of_their_own():
+    rng = np.random.default_rng(0)
+    for _ in range(50):
+        ends, share = rng.normal(size=(2, 3)), rng.permutation([0.0, rng.random(), 1.0])
+        line = Mesh(ends[0] + share[:, None] * (ends[1] - ends[0]), [[0, 1, 2]])
+        point = ends[0] + rng.random(1) * (ends[1] - ends[0])
+        _, weights, distance = closest_points(line, point[None], np.full((1, 3), np.nan))
+        np.testing.assert_allclose(weights[0] @ line.vertices, point, atol=1e-8)
+        assert distance[0] < 1e-8 and weights.min() >= 0
+
+
+def test_turned_marching_cubes_give_another_mesh_for_every_seed(surface):
+    made = [remesh(surface, 300, "marching", seed, turned=True) for seed in (1, 2, 2)]
+    first = [np.sort(each.mesh.vertices[:, 0]) for each in made]
+    assert len(first[0]) != len(first[1]) or np.abs(first[0] - first[1]).max() > 1e-3
+    np.testing.assert_array_equal(made[1].mesh.vertices, made[2].mesh.vertices)
+    for each in made:
+        assert each.distance.max() < 0.9 * solid(each.mesh).edges_unique_length.mean()
+
+
+@pytest.mark.parametrize("mixture", MIXTURES)
+def test_a_mixture_leaves_out_what_an_open_surface_cannot_have(mixture, monkeypatch):
+    taken = set()
+    for name in POLICIES:
+        monkeypatch.setitem(POLICIES, name, lambda tool, rng, name=name: taken.add(name))
+    for seed in range(40):
+        remesh(lattice(6, 6), 30, mixture, seed)
+    assert taken == {"isotropic", "adaptive", "refined", "simplified"}
+
+
+def test_a_surface_without_area_is_refused():
+    for faces in ([], [[0, 1, 2]]):
+        with pytest.raises(MeshError, match="surface area must be above 0 to remesh it"):
+            remesh(Mesh(np.zeros((3, 3)), faces), 12)
 
 
 def test_without_an_agreeing_face_the_nearest_counts():

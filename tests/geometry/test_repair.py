@@ -71,6 +71,17 @@ def test_the_surface_is_cut_open_along_an_edge_with_three_faces():
     assert sorted(found.place) == sorted(set(found.place))
 
 
+def test_a_bow_tie_stays_where_no_edge_is_cut():
+    vertices = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, 1]], dtype=float)
+    faces = np.array([[0, 1, 2], [1, 0, 3], [0, 1, 4]])
+    tie = np.array([[0, 0, 0], [1, 0.5, 0], [1, -0.5, 0], [-1.2, -0.5, 0], [-1.2, 0.5, 0.1]])
+    both = np.concatenate([vertices, tie + 10]), np.concatenate([faces, [[5, 7, 6], [5, 9, 8]]])
+    found = repair(*both, "a")
+    assert found.changes == ["1 edges with more than two faces cut open"]
+    assert len(found.mesh.vertices) == 9 + 5
+    assert len(np.unique(found.place)) == 10
+
+
 def test_turned_faces_are_turned_back():
     faces = SPHERE.faces.copy()
     faces[[3, 17, 40]] = faces[[3, 17, 40], ::-1]

@@ -114,6 +114,21 @@ def test_a_ray_that_cannot_start_stays_at_the_vertex():
     assert ((corner == 0).all(axis=0)).sum() >= 6 and (vertices >= 0).all()
 
 
+@pytest.mark.parametrize("side", [1, -1])
+@pytest.mark.parametrize("outside", [1, -1])
+def test_a_start_off_the_surface_is_the_nearest_edge_and_its_ray_starts(side, outside):
+    mesh = lattice(9, 9)
+    rng = np.random.default_rng(0)
+    mesh = Mesh(mesh.vertices + rng.uniform(-0.1, 0.1, (81, 3)) * [1, 1, 0], mesh.faces)
+    boundary = np.arange(1, 8) + (72 if outside > 0 else 0)
+    axes = np.tile([0.8 * side, 0.5 * outside, 0], (81, 1))
+    start = np.nan_to_num(surface_directions(mesh, axes))
+    first = positions(mesh, 0.6, 1, 8, start)[boundary, 1]
+    steps = first - mesh.vertices[boundary]
+    np.testing.assert_allclose(np.linalg.norm(steps, axis=1), 0.6, atol=1e-4)
+    assert (steps[:, 0] * side > 0.4).all()
+
+
 @pytest.mark.parametrize("mesh", [bow_tie(), two_cones(), punctured(bumpy_sphere(), 0.3)])
 def test_bow_ties_holes_and_isolated_vertices_give_whole_sequences(mesh):
     axes = local_frames(mesh.vertices, 1.5)[:, 0]

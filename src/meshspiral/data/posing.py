@@ -26,7 +26,7 @@ class Range(NamedTuple):
 # chosen by us, within what adults can do
 TRUNK = {
     "lean_forward": Range(-15, 0, 50),  # of the whole body at the hips
-    "lean_left": Range(-10, 0, 10),
+    "lean_right": Range(-10, 0, 10),
     "spine_forward": Range(-25, 0, 50),
     "spine_left": Range(-28, 0, 28),
     "spine_turn": Range(-40, 0, 40),
@@ -82,8 +82,8 @@ def bone_rotations(pose: Mapping[str, float], joints: Joints) -> dict[str, np.nd
     Returns:
         float64 [3, 3] for each bone that turns, in the axes of the body.
     """
-    forward, left = about(X, pose["lean_forward"]), about(Y, -pose["lean_left"])
-    found = {"root": forward * left}
+    forward, right = about(X, pose["lean_forward"]), about(Y, -pose["lean_right"])
+    found = {"root": forward * right}
     for part, bones in (("spine", SPINE), ("head", NECK)):
         for bone, share in bones.items():
             turn, bend, side = (pose[f"{part}_{way}"] for way in ("turn", "forward", "left"))

@@ -9,7 +9,15 @@ import numpy as np
 
 from meshspiral.data.cache import Arrays, Cache, code_version
 from meshspiral.data.preprocessing import Task, load_task, run_tasks
-from meshspiral.data.shapes import DataError, Shape, ShapeSet, SurfacePoints, epoch_of, name_in
+from meshspiral.data.shapes import (
+    DataError,
+    Shape,
+    ShapeSet,
+    SurfacePoints,
+    epoch_of,
+    name_in,
+    nearest_labels,
+)
 from meshspiral.geometry import mesh as meshes
 from meshspiral.geometry import remesh
 from meshspiral.geometry.barycentric import interpolate
@@ -109,8 +117,7 @@ class Remeshed(ShapeSet):
             any_normal = np.full_like(point, np.nan)
             face, weights, _ = remesh.closest_points(self.template, point, any_normal)
             corners = self.template.faces[face]
-        nearest = np.linalg.norm(template[corners] - point[:, None], axis=2).argmin(axis=1)
-        labels = corners[np.arange(len(corners)), nearest]
+        labels = nearest_labels(self.template, corners, point)
         return Shape(mesh, labels, len(template), SurfacePoints(corners, weights))
 
     def stamp(self, name: str) -> str | None:
@@ -157,7 +164,7 @@ class Remeshed(ShapeSet):
             draw = np.random.default_rng(derived_seed(*content, "vertices")).uniform
             vertices = round(np.exp(draw(*np.log(vertices))))
         key = digest(*content, vertices, code, self._version)
-        return Task("meshes", key, _remesh, (source, vertices, self._policy, seed))
+        return Task("meshes", key, _remesh, (source, vertices, self._policy, seed, copy > 1))
 
 
 def torn(before: np.ndarray, after: np.ndarray, faces: np.ndarray) -> np.ndarray:
@@ -190,8 +197,8 @@ def usual_size(vertices: int) -> int:
     return round(size / 100) * 100 if size > 1000 else max(12, round(size))
 
 
-def _remesh(source: Mesh, vertices: int, policy: str, seed: int) -> Arrays:
-    made = remesh.remesh(source, vertices, policy, seed)
+def _remesh(source: Mesh, vertices: int, policy: str, seed: int, turned: bool) -> Arrays:
+    made = remesh.remesh(source, vertices, policy, seed, turned)
     return {
         "vertices": made.mesh.vertices,
         "faces": made.mesh.faces.astype(np.int32),

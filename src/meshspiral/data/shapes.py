@@ -199,6 +199,18 @@ def subject_split(names: list[str], per_subject: int = 10) -> dict[str, list[str
     return {split: [n for subject in group for n in subject] for split, group in groups.items()}
 
 
+def nearest_labels(template: Mesh, corners: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """The corner nearest to each point, int64 [V].
+
+    Args:
+        template: The template.
+        corners: Its vertices around each point, int64 [V, 3].
+        points: Positions near its surface, float64 [V, 3].
+    """
+    apart = np.linalg.norm(template.vertices[corners] - points[:, None], axis=2)
+    return corners[np.arange(len(corners)), apart.argmin(axis=1)]
+
+
 def registered_shape(mesh: Mesh, template: Mesh) -> Shape:
     """The shape of a mesh in the template's vertex order: vertex i has label i.
 

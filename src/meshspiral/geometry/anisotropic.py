@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.sparse import csc_array
 
-from meshspiral.geometry.laplacian import eigenfunctions_of, masses_of
+from meshspiral.geometry.laplacian import FLAT, eigenfunctions_of, masses_of
 from meshspiral.geometry.mesh import Mesh
 
 ROWS = 1024  # rows of a kernel at a time
@@ -42,7 +42,7 @@ def anisotropic_stiffness(
         anisotropy: At least 0; with 0 the matrix is that of the cotangent Laplacian.
 
     Returns:
-        [V, V], symmetric and positive semi-definite; faces of area 0 have no part.
+        [V, V], symmetric and positive semi-definite.
     """
     corners = mesh.vertices[mesh.faces]
     opposite = np.roll(corners, -2, axis=1) - np.roll(corners, -1, axis=1)
@@ -59,10 +59,8 @@ def anisotropic_stiffness(
     # a hat function's gradient is the opposite edge turned by a right angle, over twice the area
     gradients = np.stack([-edges[:, :, 1], edges[:, :, 0]], axis=2)
     conductivity = np.array([1.0, 1.0 / (1.0 + anisotropy)])
-    with np.errstate(invalid="ignore", divide="ignore"):
-        terms = np.einsum("fka,a,fla->fkl", gradients, conductivity, gradients)
-        terms /= 2 * doubled[:, None, None]
-    terms[doubled == 0] = 0.0
+    terms = np.einsum("fka,a,fla->fkl", gradients, conductivity, gradients)
+    terms /= 2 * (doubled + FLAT * mesh.area)[:, None, None]
     rows = np.repeat(mesh.faces, 3, axis=1).ravel()
     columns = np.tile(mesh.faces, 3).ravel()
     shape = (len(mesh.vertices),) * 2

@@ -10,9 +10,10 @@ from scipy.linalg import eigh
 from scipy.sparse import csc_array, diags_array
 from scipy.sparse.linalg import ArpackError, eigsh
 
-from meshspiral.geometry.mesh import Mesh, MeshError
+from meshspiral.geometry.mesh import Mesh, MeshError, used_vertices
 
 ROUNDS = 100  # iterations of ARPACK; a mesh needs a few, one far from a surface would take minutes
+FLAT = 1e-10  # of the surface's area, is added to twice the area of a face, which may be 0
 SMALL = 400  # vertices up to which all eigenfunctions are computed at once, which is faster there
 
 
@@ -21,8 +22,8 @@ class Spectrum(NamedTuple):
 
     Attributes:
         values: float64 [K], ascending, at least 0, in 1 over the square of the mesh's unit.
-        functions: float64 [V, K], orthonormal with respect to the masses. Signs, and bases of
-            repeated eigenvalues, are arbitrary.
+        functions: float64 [V, K], orthonormal with respect to the masses, and 0 at vertices on no
+            face. Signs, and bases of repeated eigenvalues, are arbitrary.
         masses: float64 [V], in the square of the mesh's unit.
     """
 
@@ -45,7 +46,9 @@ def laplacian(mesh: Mesh) -> tuple[csc_array, np.ndarray]:
         MeshError: The surface has no area.
     """
     masses = masses_of(mesh)
-    stiffness = potpourri3d.cotan_laplacian(mesh.vertices, mesh.faces, denom_eps=1e-10)
+    # it does not depend on the unit of length, but denom_eps does
+    unit = mesh.vertices / np.sqrt(mesh.area)
+    stiffness = potpourri3d.cotan_laplacian(unit, mesh.faces, denom_eps=FLAT)
     return csc_array(stiffness), masses
 
 
@@ -71,7 +74,7 @@ def spectrum(mesh: Mesh, count: int) -> Spectrum:
 
     Args:
         mesh: The surface.
-        count: Number of eigenfunctions K; a mesh of fewer vertices has as many as vertices.
+        count: Number of eigenfunctions K; at most that of the vertices on a face.
 
     Returns:
         K eigenvalues, ascending; functions, with columns orthonormal under the masses; and masses.
@@ -90,11 +93,18 @@ def eigenfunctions_of(mesh: Mesh, stiffness: csc_array, masses: np.ndarray, coun
         mesh: The surface, for its area and for messages.
         stiffness: [V, V], positive semi-definite.
         masses: float64 [V], above 0.
-        count: Number of solutions K; at most V are returned.
+        count: Number of solutions K; at most that of the vertices on a face.
 
     Raises:
         MeshError: ARPACK finds no solution.
     """
+    used, faces = used_vertices(mesh.faces)
+    if len(used) < len(masses):  # a vertex alone would have an eigenvalue of 0 of its own
+        part = Mesh(mesh.vertices[used], faces, mesh.name)
+        inner = eigenfunctions_of(part, stiffness[used][:, used], masses[used], count)
+        functions = np.zeros((len(masses), inner.functions.shape[1]))
+        functions[used] = inner.functions
+        return Spectrum(inner.values, functions, masses)
     if len(masses) <= max(SMALL, count + 1):
         roots = np.sqrt(masses)
         matrix = stiffness.toarray() / np.outer(roots, roots)

@@ -9,6 +9,8 @@ remeshes finely before it goes to the resolution wanted.
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -21,6 +23,8 @@ FUSED = (0.006, 0.012)  # half the width of gaps that "fused" closes, over the s
 CELL = 0.012  # of its marching cubes, over the size of the mesh
 NEAREST = 16  # faces, by their centres, that are tried first for a closest point
 FACING = 0.2  # least cosine between the normal of a point and that of its closest face
+
+Policy = Callable[["Tool", np.random.Generator], None]
 
 
 class Remeshed(NamedTuple):
@@ -39,7 +43,9 @@ class Remeshed(NamedTuple):
     distance: np.ndarray
 
 
-def remesh(mesh: Mesh, vertices: int, policy: str = "isotropic", seed: int = 0) -> Remeshed:
+def remesh(
+    mesh: Mesh, vertices: int, policy: str = "isotropic", seed: int = 0, turned: bool = False
+) -> Remeshed:
     """Remesh a surface; the new vertices are in random order.
 
     The policies:
@@ -48,11 +54,11 @@ def remesh(mesh: Mesh, vertices: int, policy: str = "isotropic", seed: int = 0) 
     - adaptive: edges that are shorter where the surface is curved, see `bending`.
     - refined: edges that are shorter around four random vertices.
     - simplified: a fine mesh reduced by quadrics, with triangles stretched along flat directions.
-    - marching: marching cubes, with slivers; thin parts are lost.
+    - marching: marching cubes, with slivers; thin parts are lost. For closed surfaces.
     - fused: edges of equal length; gaps narrower than twice a distance drawn from `FUSED`, as
       between fingers, are filled. For closed surfaces.
-    - mixed: one of the first five, drawn with the seed.
-    - scans: one of the six.
+    - mixed: one of the first five, drawn with the seed; for an open surface one of four.
+    - scans: one of the six; for an open surface one of four.
 
     Args:
         mesh: The source.
@@ -60,35 +66,66 @@ def remesh(mesh: Mesh, vertices: int, policy: str = "isotropic", seed: int = 0) 
             fewer.
         policy: One of POLICIES or MIXTURES.
         seed: Determines all random choices.
+        turned: Whether marching cubes work on the surface turned at random. Their grid is fixed:
+            without a turn, most seeds give the same surface.
 
     Returns:
         The remeshed surface and its closest points on the source.
 
     Raises:
-        MeshError: `vertices` is below 12, the policy is unknown, the source of "fused" is not
-            closed, PyMeshLab cannot remesh the source to that size, or PyMeshLab is not installed.
+        MeshError: `vertices` is below 12, the policy is unknown, the source of "marching" or
+            "fused" is not closed, the source has no area, PyMeshLab cannot remesh it to that size,
+            or PyMeshLab is not installed.
     """
     if policy not in (known := [*POLICIES, *MIXTURES]):
         raise MeshError(f"policy must be one of {', '.join(known)}; got {policy!r}")
     if vertices < 12:
         raise MeshError(f"vertices must be at least 12, got {vertices}")
+    if not mesh.area > 0:
+        raise MeshError(f"{mesh.name}: surface area must be above 0 to remesh it, got {mesh.area}")
     rng = np.random.default_rng(seed)
+    closed = not border(mesh.faces)
     if policy in MIXTURES:
-        policy = str(rng.choice(MIXTURES[policy]))
-    tool = Tool(mesh, vertices, rng)
-    for _ in range(6):
-        POLICIES[policy](tool, rng)
-        count = tool.count
-        if count >= (0.95 if policy == "marching" else 0.9 if tool.border() else 1) * vertices:
-            break
-        tool.edge *= 0.97 * np.sqrt(count / vertices)
-    else:
-        raise MeshError(f"{mesh.name}: cannot be remeshed to {vertices} vertices, got {count}")
-    if count > vertices:
-        tool.simplify()
+        policy = str(rng.choice([p for p in MIXTURES[policy] if closed or p not in CLOSED]))
+    if policy in CLOSED and not closed:
+        raise MeshError(f"{mesh.name}: policy {policy} needs a closed surface")
+    turn = np.eye(3)
+    if turned and policy == "marching":
+        turn = trimesh.transformations.random_rotation_matrix(rng.random(3))[:3, :3]
+    tool = Tool(replace(mesh, vertices=mesh.vertices @ turn.T), vertices, rng)
+    try:
+        _apply(POLICIES[policy], tool, rng, 0.95 if policy == "marching" else 1)
+    except tool.failure as error:
+        raise MeshError(f"{mesh.name}: PyMeshLab cannot remesh it ({error})") from error
     points, faces = tool.result()
-    result = Mesh(points, faces, mesh.name).renumbered(rng.permutation(len(points)))
+    result = Mesh(points @ turn, faces, mesh.name).renumbered(rng.permutation(len(points)))
     return Remeshed(result, *closest_points(mesh, result.vertices, result.vertex_normals))
+
+
+def _apply(policy: Policy, tool: Tool, rng: np.random.Generator, share: float) -> None:
+    """Remesh by a policy, again with shorter edges as long as there are too few vertices.
+
+    Args:
+        policy: One of the values of POLICIES.
+        tool: Holds the source, then the result.
+        rng: For the policy.
+        share: The least share of the number of vertices wanted, for a result without boundary.
+
+    Raises:
+        MeshError: Six times were not enough.
+    """
+    for _ in range(6):
+        policy(tool, rng)
+        count = tool.count
+        if count >= (min(share, 0.9) if tool.border() else share) * tool.vertices:
+            break
+        tool.edge *= 0.97 * np.sqrt(count / tool.vertices)
+    else:
+        raise MeshError(
+            f"{tool.source.name}: cannot be remeshed to {tool.vertices} vertices, got {count}"
+        )
+    if count > tool.vertices:
+        tool.simplify()
 
 
 def closest_points(
@@ -109,7 +146,8 @@ def closest_points(
         The faces of the closest points, int64 [Q]; their barycentric coordinates, float64 [Q, 3];
         and their distances, float64 [Q].
     """
-    triangles = mesh.vertices[mesh.faces]
+    unit = mesh.mean_edge or 1.0  # trimesh compares areas with a fixed number
+    triangles, points = mesh.vertices[mesh.faces] / unit, points / unit
     centres = triangles.mean(axis=1)
     reach = np.linalg.norm(triangles - centres[:, None], axis=2).max(axis=1)
     directions = mesh.face_normals / np.maximum(
@@ -147,9 +185,33 @@ def closest_points(
     for facing in (FACING, -np.inf):
         for query in np.flatnonzero(np.isinf(distance)):
             consider(np.full(len(centres), query), np.arange(len(centres)), facing)
-    weights = trimesh.triangles.points_to_barycentric(triangles[face], closest)
+    return face, _barycentric(triangles[face], closest), distance * unit
+
+
+def _barycentric(triangles: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """Barycentric coordinates, float64 [Q, 3], of points on triangles, [Q, 3] and [Q, 3, 3].
+
+    Where a triangle has hardly any area, they are taken along its longest edge. The unit of length
+    is about an edge.
+    """
+    weights = trimesh.triangles.points_to_barycentric(triangles, points)
     weights = np.clip(np.nan_to_num(weights, nan=1 / 3), 0, None)
-    return face, weights / weights.sum(axis=1, keepdims=True), distance
+    weights /= weights.sum(axis=1, keepdims=True)
+    off = np.linalg.norm(np.einsum("qk,qkx->qx", weights, triangles) - points, axis=1)
+    for q in np.flatnonzero(off > 1e-9):
+        edges = np.roll(triangles[q], -1, axis=0) - triangles[q]
+        squares = (edges**2).sum(axis=1)
+        a = int(squares.argmax())
+        along = (points[q] - triangles[q, a]) @ edges[a] / squares[a] if squares[a] > 0 else 0.0
+        weights[q] = 0.0
+        weights[q, a], weights[q, (a + 1) % 3] = 1 - np.clip(along, 0, 1), np.clip(along, 0, 1)
+    return weights
+
+
+def border(faces: np.ndarray) -> int:
+    """The number of boundary edges of faces, int [F, 3]."""
+    edges = trimesh.geometry.faces_to_edges(faces)
+    return len(trimesh.grouping.group_rows(np.sort(edges, axis=1), require_count=1))
 
 
 def bending(mesh: Mesh, radius: float) -> np.ndarray:
@@ -204,6 +266,7 @@ class Tool:
     Attributes:
         edge: The edge length of an isotropic mesh with the number of vertices wanted. `remesh`
             shortens it if the result has too few.
+        failure: The type of PyMeshLab's exceptions.
 
     Raises:
         MeshError: PyMeshLab is not installed.
@@ -215,6 +278,7 @@ class Tool:
         except ImportError as error:
             raise MeshError("remeshing needs PyMeshLab: pip install pymeshlab") from error
         self._lab, self.source, self.vertices, self._rng = pymeshlab, mesh, vertices, rng
+        self.failure = pymeshlab.PyMeshLabException
         self.area = mesh.area
         self.edge = equilateral_edge(self.area, vertices)
         self.reset()
@@ -239,8 +303,7 @@ class Tool:
 
     def border(self) -> int:
         """The number of boundary edges."""
-        edges = trimesh.geometry.faces_to_edges(self._set.current_mesh().face_matrix())
-        return len(trimesh.grouping.group_rows(np.sort(edges, axis=1), require_count=1))
+        return border(self._set.current_mesh().face_matrix())
 
     def isotropic(self, edge: float, times: int, selected=False) -> None:
         """Remesh isotropically to an edge length, in `times` iterations; only the selected faces if
@@ -406,8 +469,6 @@ def _marching(tool: Tool, rng: np.random.Generator) -> None:
 def _fused(tool: Tool, rng: np.random.Generator) -> None:
     """A morphological closing: the surface at a distance outside, and back to that inside it."""
     tool.reset()
-    if tool.border():
-        raise MeshError(f"{tool.source.name}: policy fused needs a closed surface")
     size = np.sqrt(tool.area)
     distance = size * rng.uniform(*FUSED)
     for offset in (distance, -distance):
@@ -416,7 +477,7 @@ def _fused(tool: Tool, rng: np.random.Generator) -> None:
     tool.isotropic(tool.edge, 8)
 
 
-POLICIES = {  # how a Tool gets about the number of vertices wanted
+POLICIES: dict[str, Policy] = {  # how a Tool gets about the number of vertices wanted
     "isotropic": _isotropic,
     "adaptive": _adaptive,
     "refined": _refined,
@@ -424,4 +485,5 @@ POLICIES = {  # how a Tool gets about the number of vertices wanted
     "marching": _marching,
     "fused": _fused,
 }
+CLOSED = ("marching", "fused")  # need a closed surface: marching cubes invent one at a boundary
 MIXTURES = {"mixed": list(POLICIES)[:5], "scans": list(POLICIES)}

@@ -191,7 +191,8 @@ def _cut_open(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, int]:
     """Separate faces along edges, by copies of their vertices.
 
-    Corners of faces remain one vertex where a path over the other edges connects them.
+    Corners of faces at the end of a cut edge remain one vertex where a path over the other edges
+    connects them.
 
     Args:
         vertices: float64 [V, 3].
@@ -217,7 +218,12 @@ def _cut_open(
     uncut = np.flatnonzero(~cut)[order]
     same = key[uncut[1:]] == key[uncut[:-1]]
     one, two = uncut[:-1][same], uncut[1:][same]
-    rows, columns = np.concatenate([low[one], high[one]]), np.concatenate([low[two], high[two]])
+    # where no edge is cut, all corners stay one vertex, even of faces that meet there alone
+    corners = np.flatnonzero(~np.isin(faces.ravel(), undirected[cut]))
+    corners = corners[np.argsort(faces.ravel()[corners], kind="stable")]
+    again = faces.ravel()[corners[1:]] == faces.ravel()[corners[:-1]]
+    rows = np.concatenate([low[one], high[one], corners[:-1][again]])
+    columns = np.concatenate([low[two], high[two], corners[1:][again]])
     graph = coo_array((np.ones(len(rows)), (rows, columns)), shape=(len(edges), len(edges)))
     count, number = connected_components(graph, directed=False)
     origin = np.empty(count, dtype=np.int64)

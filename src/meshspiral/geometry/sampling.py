@@ -154,7 +154,9 @@ def _directions(vertices, neighbours, first, left, sectors, normals, axes, direc
         for k in range(first[v], first[v + 1]):
             angle = _edge_angle(vertices, v, neighbours[k], tangent, bitangent)
             if abs(angle) < beside and inside == np.inf:
-                beside, directions[v] = abs(angle), sectors[k, 0]
+                # of the last edge before a boundary: just inside the last face
+                beside = abs(angle)
+                directions[v] = sectors[k, 0] * (1 - 1e-9 if left[k] < 0 else 1)
             if left[k] < 0:
                 continue
             below = -angle % (2 * np.pi)
