@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from omegaconf import OmegaConf
 
 from meshspiral.commands.draw import main
 from meshspiral.data.shapes import DataError
@@ -23,6 +24,12 @@ def test_both_tessellations_are_drawn(cli, toy_overrides, tmp_path):
         "around.v2.png",
     ]
     assert "around.v2.png" in out
+
+
+def test_both_neighbourhoods_start_where_the_frame_points(cli):
+    code, out, _ = cli("--cfg", "job", program=main)
+    drawn = OmegaConf.create(out).neighbourhoods
+    assert code == 0 and drawn.spiral.start == drawn.sampled.start == "frame"
 
 
 @pytest.mark.parametrize(

@@ -16,7 +16,13 @@ from meshspiral.viz.colors import (
     point_colors,
     template_colors,
 )
-from meshspiral.viz.plots import all_curves_figure, curve_figure, encoded, sketch_figure
+from meshspiral.viz.plots import (
+    all_curves_figure,
+    curve_figure,
+    encoded,
+    neighbourhood_figure,
+    sketch_figure,
+)
 from meshspiral.viz.render import Row, render, upright
 from tests.meshes import bumpy_sphere, lattice
 
@@ -101,3 +107,14 @@ def test_a_flat_mesh_is_drawn():
         assert encoded(sketch_figure(flat.vertices, flat.faces, rows[-1].colors[0]), "png")
     for picture in render(rows, "y"):
         assert picture.images[0].shape[1] < 25 * picture.images[0].shape[0]
+
+
+def test_neighbourhoods_of_one_point_are_seen_from_one_side():
+    """Although the normal at it differs between two tessellations."""
+    mesh = bumpy_sphere(2)
+    turn = [[1, 0, 0], [0, np.cos(0.1), -np.sin(0.1)], [0, np.sin(0.1), np.cos(0.1)]]
+    other = Mesh(mesh.vertices @ np.transpose(turn), mesh.faces)
+    points = mesh.vertices[:9]
+    panels = [("one", mesh, 5, points), ("other", other, 5, points)]
+    one, other = (a.lines[0].get_xydata() for a in neighbourhood_figure(panels, up="z").axes)
+    np.testing.assert_allclose(one - one[0], other - other[0], atol=1e-12)

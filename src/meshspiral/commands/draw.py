@@ -41,7 +41,7 @@ def main(config: DrawConfig) -> None:
             around = Neighbourhood.of(settings)
             points = sequence_points(shape.mesh, around, vertex)
             panels.append((f"{tessellation}: {around.title}", shape.mesh, vertex, points))
-    figure = neighbourhood_figure(panels, columns=len(config.neighbourhoods))
+    figure = neighbourhood_figure(panels, shapes.up, columns=len(config.neighbourhoods))
     for kind in KINDS:
         path = Path(f"{config.output}.{kind}")
         path.parent.mkdir(parents=True, exist_ok=True)

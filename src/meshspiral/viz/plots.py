@@ -188,15 +188,18 @@ def picture_figure(
 
 
 def neighbourhood_figure(
-    panels: list[tuple[str, Mesh, int, np.ndarray]], columns: int = 2
+    panels: list[tuple[str, Mesh, int, np.ndarray]], up: str, columns: int = 2
 ) -> Figure:
-    """Sequences of points around vertices, each in the tangent plane of its vertex.
+    """Sequences of points around a point of a surface, all in its tangent plane.
 
     Args:
         panels: For each panel a title, a mesh, the vertex at the centre, and the points of the
             sequence, float [N, 3].
+        up: The axis that points up, "y" or "z".
         columns: Number of panels side by side.
     """
+    normal = np.sum([mesh.vertex_normals[v] for _, mesh, v, _ in panels], axis=0)
+    plane = _tangent_plane(normal / np.linalg.norm(normal), up)  # the same view of all
     rows = -(-len(panels) // columns)
     figure = Figure(figsize=(4.2 * columns, 4.3 * rows), layout="constrained")
     reach = 1.15 * max(
@@ -205,7 +208,6 @@ def neighbourhood_figure(
     for axes, (title, mesh, v, points) in zip(
         figure.subplots(rows, columns, squeeze=False).flat, panels, strict=False
     ):
-        plane = _tangent_plane(mesh.vertex_normals[v])
         near = np.linalg.norm(mesh.vertices - mesh.vertices[v], axis=1) < 1.6 * reach
         front = (mesh.vertex_normals @ mesh.vertex_normals[v]) > 0
         flat = (mesh.vertices - mesh.vertices[v]) @ plane.T
@@ -234,11 +236,13 @@ def _connected(faces: np.ndarray, v: int, count: int) -> np.ndarray:
     return faces[component[faces[:, 0]] == component[v]]
 
 
-def _tangent_plane(normal: np.ndarray) -> np.ndarray:
+def _tangent_plane(normal: np.ndarray, up: str) -> np.ndarray:
     """Two orthonormal rows that span the plane across a normal, float64 [2, 3]; the second one
     points up, as far as it can."""
-    up = np.eye(3)[1 if abs(normal[1]) < 0.9 else 2]
-    right = np.cross(up, normal)
+    axis = np.eye(3)["xyz".index(up)]
+    if abs(axis @ normal) > 0.99:  # seen from above or below
+        axis = np.roll(axis, 1)
+    right = np.cross(axis, normal)
     right /= np.linalg.norm(right)
     return np.stack([right, np.cross(normal, right)])
 
