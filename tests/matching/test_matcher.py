@@ -187,11 +187,19 @@ def upper_half() -> Mesh:
 
 def test_with_a_scale_radii_are_those_of_the_template(trained):
     size = TEMPLATE.size
-    for scale in (1.0, 0.001):
+    for scale in (1.0, 0.1):
         sized = Matcher.load(trained, scale=scale)._sized(upper_half(), lambda stage: None)
         assert sized.size == pytest.approx(size / scale)
     sized = Matcher.load(trained, scale=size / SOURCE.size)._sized(SOURCE, lambda stage: None)
     np.testing.assert_allclose(normalize(sized).vertices, normalize(SOURCE).vertices)
+
+
+@pytest.mark.parametrize("options", [{"scale": 0.001}, {"height": 1700.0}])
+def test_a_mesh_in_another_unit_than_the_given_one_is_refused(trained, options):
+    matcher = Matcher.load(trained, **options)
+    matcher.label(scan(1000 * SOURCE.vertices, SOURCE.faces, "millimetres"))
+    with pytest.raises(MeshError, match=r"metres: .* is this mesh in another unit"):
+        matcher.label(scan(SOURCE.vertices, SOURCE.faces, "metres"))
 
 
 def test_the_size_of_an_open_surface_is_that_of_which_the_network_is_surest(matcher, monkeypatch):

@@ -1,7 +1,7 @@
 """Matching two meshes: a network labels both with points of a template, which are then compared.
 
 matcher = Matcher.load()
-match = matcher.match(scan(*a, "a"), scan(*b, "b"))
+match = matcher.match(open_scan("a.ply"), open_scan("b.obj"))
 match.target[v]  # the vertex of b that corresponds to vertex v of a
 """
 
@@ -31,7 +31,7 @@ from meshspiral.experiment.run_folder import BEST
 from meshspiral.experiment.schema import TrainConfig
 from meshspiral.geometry.holes import has_large_holes
 from meshspiral.geometry.kdtree import kd_tree
-from meshspiral.geometry.mesh import Mesh
+from meshspiral.geometry.mesh import Mesh, MeshError
 from meshspiral.geometry.resample import resample, resampled
 from meshspiral.geometry.zoomout import TO, eigenfunctions, zoomout
 from meshspiral.matching.confidence import (
@@ -57,6 +57,7 @@ MESH_STAGES = (
 )
 Report = Callable[[str], None]  # is told each stage when it begins; not every mesh has all
 FACTORS = (1.0, 1.1, 1.2, 1.3, 1.45, 1.6, 1.8, 2.1, 2.5)  # tried for the size of an open surface
+UNIT_ERROR = 50.0  # a complete shape of which a mesh is a smaller or larger part has another unit
 NEAR = 5.0  # mean edges of the template; labels further apart are not interpolated
 # of an ensemble: vertices over those of a training mesh, and size over that of the mesh
 COPIES = ((0.72, 0.96), (1.0, 1.0), (1.38, 1.04))
@@ -138,6 +139,8 @@ class Matcher:
     Raises:
         RunError: The checkpoint has no template, or its weights do not fit its config.
         ConfigError: There is no GPU.
+        ValueError: `refine` is unknown; `scale` or `height` is not positive and finite, or both are
+            given.
     """
 
     def __init__(
@@ -204,7 +207,8 @@ class Matcher:
             The labels of the user's vertices.
 
         Raises:
-            MeshError: The mesh cannot be described, resampled or smoothed.
+            MeshError: The mesh cannot be described, resampled or smoothed, or its size contradicts
+                `scale` or `height` by a factor of UNIT_ERROR.
         """
         return self.predict(scan)[0]
 
@@ -269,8 +273,13 @@ class Matcher:
     def _sized(self, mesh: Mesh, report: Report) -> Mesh:
         """The mesh with the area of the complete surface, if it is known or can be found."""
         if self._scale is not None:
-            complete_area = (self.template.size / self._scale) ** 2
-            return replace(mesh, complete_area=complete_area)
+            complete = self.template.size / self._scale
+            if not 1 / UNIT_ERROR < mesh.size / complete < UNIT_ERROR:
+                raise MeshError(
+                    f"{mesh.name}: sqrt(area) is {mesh.size:.3g}, but by the given scale or height "
+                    f"{complete:.3g} for a complete shape; is this mesh in another unit?"
+                )
+            return replace(mesh, complete_area=complete**2)
         if not has_large_holes(mesh):
             return mesh
         report("size")

@@ -32,8 +32,9 @@ def registered(labelled: LabelledScan, template: Mesh) -> tuple[np.ndarray, np.n
         template: Mesh with K vertices.
 
     Returns:
-        Positions, float64 [K, 3], in the mesh's coordinates; and the confidence of each, float
-        [K]: 0 where no point of the mesh has a label near the vertex.
+        Positions, float64 [K, 3], in the mesh's coordinates, NaN if no point of the mesh has a
+        usable label; and the confidence of each, float [K]: 0 where no point of the mesh has a
+        label near the vertex.
     """
     mesh, labels = labelled.scan.mesh, labelled.labels
     points, confidence = labelled.on_mesh(labels.points), labelled.on_mesh(labels.confidence)
