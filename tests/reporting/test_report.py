@@ -16,6 +16,7 @@ import pytest
 import trimesh
 
 from meshspiral.commands.report import main
+from meshspiral.data.settings import DamageSettings
 from meshspiral.experiment.run_folder import CONFIG, METRICS
 from meshspiral.nn.networks import FCSNet, Network
 from meshspiral.reporting.groups import data_labels, group_runs, length_keys, varied_settings
@@ -117,6 +118,23 @@ def test_runs_that_differ_in_the_seed_alone_are_one_group(sweep):
     assert {r.folder.name for r in pair.runs} == {"fcs5", "fcs5_again"}
     assert pair.curves.shape[0] == 2
     assert varied_settings(runs) == ["optim.lr"]
+
+
+def test_data_labels_can_be_read(sweep):
+    """Settings of training shapes alone tell groups apart, but not the data sets."""
+    run = read_runs(str(sweep))[0][0]
+    damage = DamageSettings(
+        noise=0.002, warp=0, share=0, cut=0, holes=0, hole_radius=0, missing=0, size=0, seed=0
+    )
+    runs = [run, *(changed(run, data=data) for data in ({"fresh": True}, {"damage": damage}))]
+    assert data_labels(runs) == ["folder"] * 3
+    assert varied_settings(runs) == ["data.damage", "data.fresh"]
+    assert len(group_runs(runs)) == 3
+    other = (
+        changed(run, data={"shuffle_vertices": True}),
+        changed(run, data={"labels": "{stem}.npy"}),
+    )
+    assert data_labels([run, *other])[1:] == ["folder {stem}.txt", "folder {stem}.npy"]
 
 
 def test_the_comparisons_of_the_paper_are_found(sweep):

@@ -19,6 +19,12 @@ from meshspiral.reporting.runs import Run
 
 # data settings that do not tell data sets apart
 COMPUTED = ("features", "shuffle_vertices", "half")
+TRAINING = (
+    "fresh",
+    "damage",
+    "remesh.copies",
+    "remesh.shared",
+)  # these change training shapes only
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,11 +120,8 @@ def data_labels(runs: list[Run]) -> list[str]:
         kind = data["name"], data.get("remesh.policy")
         same_kind = [d for d in datas if (d["name"], d.get("remesh.policy")) == kind]
         differing = [k for k, v in data.items() if any(other.get(k) != v for other in same_kind)]
-        values = [
-            value if isinstance(value, str | int) else digest(json.dumps(value))[:6]
-            for value in (data[key] for key in differing if not is_computed(key))
-        ]
-        labels.append(" ".join([*filter(None, kind), *map(str, values)]))
+        values = [_label(key, data[key]) for key in differing if not is_computed(key)]
+        labels.append(" ".join([*filter(None, kind), *values]))
     hashes: dict[str, list[str]] = {}  # of the test shapes, by label
     for i, run in enumerate(runs):
         outcome = run.outcome
@@ -133,9 +136,19 @@ def data_labels(runs: list[Run]) -> list[str]:
     return labels
 
 
+def _label(key: str, value: Any) -> str:
+    """A setting in the label of a data set: names and numbers as they are, lists as a hash."""
+    if isinstance(value, str) or (isinstance(value, int) and not isinstance(value, bool)):
+        return str(value)
+    if isinstance(value, list | dict):
+        return digest(json.dumps(value))[:6]
+    return f"{short_key(key)} {format_value(value)}"
+
+
 def is_computed(key: str) -> bool:
-    """Whether a setting of a data set says what is computed of its shapes, not which they are."""
-    return key in COMPUTED or key.partition(".")[0] in Descriptor.registered
+    """Whether a setting of a data set does not say which shapes it tests on."""
+    group = key.partition(".")[0]
+    return key in (*COMPUTED, *TRAINING) or group in TRAINING or group in Descriptor.registered
 
 
 def varied_settings(runs: list[Run]) -> list[str]:
@@ -153,11 +166,18 @@ def varied_settings(runs: list[Run]) -> list[str]:
 
 
 def differing_keys(runs: list[Run]) -> set[str]:
-    """Keys of the settings that differ between two of the runs that have them."""
+    """Keys of the settings that differ between two of the runs that have them.
+
+    The key of a group that one run has and another has not, such as `data.damage`, differs too.
+    """
     values: dict[str, set[str]] = {}
     for run in runs:
         for key, value in run.settings.items():
             values.setdefault(key, set()).add(json.dumps(value))
+    for key in values:
+        for group in itertools.accumulate(key.split(".")[:-1], "{}.{}".format):
+            if group in values:
+                values[group].add("a group")
     return {key for key, several in values.items() if len(several) > 1}
 
 
