@@ -238,8 +238,8 @@ def test_two_processes_give_the_metrics_of_one(toy_overrides, tmp_path):
 
 @pytest.mark.parametrize("processes", [2])  # four: passed too, and take a minute
 def test_several_processes_train_as_one_with_accumulation(toy_overrides, tmp_path, processes):
-    """Meshes, neighbourhoods and steps are the same; dropout would differ."""
-    exact = ["trainer.precision=64", "model.dropout=0", "optim.epochs=2", "picture=false"]
+    """Meshes, neighbourhoods, dropout and steps are the same."""
+    exact = ["trainer.precision=64", "model.dropout=0.3", "optim.epochs=2", "picture=false"]
     split = ["data.train=[train/0.ply,train/1.ply,train/2.ply,train/3.ply]"]
     split += ["data.val=[val/*.ply,train/4.ply]", "data.test=[test/*.ply,train/5.ply]"]
     toy = [*toy_overrides, *split, *exact]

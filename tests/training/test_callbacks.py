@@ -1,4 +1,4 @@
-"""The progress bar of training."""
+"""The progress bar of training, validations, and the speed."""
 
 from __future__ import annotations
 
@@ -9,7 +9,33 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from meshspiral.training.callbacks import Bar
+from meshspiral.training.callbacks import Bar, Speed
+from tests.helpers import run
+
+
+def test_the_last_epoch_is_validated_too(toy_overrides, tmp_path, monkeypatch):
+    seen = []
+    monkeypatch.setattr(
+        Bar, "on_validation_start", lambda self, trainer, _: seen.append(trainer.current_epoch)
+    )
+    for name in ("on_validation_batch_end", "on_validation_end"):
+        monkeypatch.setattr(Bar, name, lambda *_: None)
+    run(tmp_path, [*toy_overrides, "optim.epochs=4", "trainer.val_every=3"])
+    assert seen == [2, 3]
+
+
+def test_the_speed_counts_steps_not_meshes(monkeypatch):
+    trainer = SimpleNamespace(accumulate_grad_batches=4)
+    logged = {}
+    speed = Speed()
+    speed.on_train_start(trainer, None)
+    for batch in range(8):
+        speed.on_train_batch_start(trainer, None, None, batch)
+        speed.on_train_batch_end(trainer, None, None, None, batch)
+    speed._busy = 1.0
+    module = SimpleNamespace(log=lambda key, value, **_: logged.update({key: value}))
+    speed.on_train_epoch_end(trainer, module)
+    assert logged == {"train/steps_per_second": 2.0}
 
 
 @pytest.mark.parametrize("columns, bar", [(80, 6), (120, 40)])

@@ -101,6 +101,10 @@ def test_the_head_is_new_if_the_template_differs(base, toy_overrides, template, 
         ),
         (["metric=true", "optim.lr=0.1"], r"model\.metric must be False, got True$"),
         (["data.shot.bins=5", "data.shot.radius=0.2"], r"data\.shot\.bins must be 4, got 5$"),
+        (
+            ["data.features=[shot,hks]"],
+            r"data\.features must be \['shot'\], got \['shot', 'hks'\]$",
+        ),
     ],
 )
 def test_what_does_not_fit_is_named(base, toy_overrides, tmp_path, overrides, message):

@@ -9,7 +9,14 @@ import shutil
 import pytest
 
 from meshspiral.data.shapes import DataError
-from meshspiral.experiment.run_folder import LAST, METRICS, RunError, Stopped, read_run_config
+from meshspiral.experiment.run_folder import (
+    LAST,
+    METRICS,
+    RunError,
+    Stopped,
+    read_run_config,
+    write_config,
+)
 from meshspiral.experiment.runs import resumed_config
 from meshspiral.training.callbacks import Speed
 from meshspiral.training.module import rate_factor
@@ -109,6 +116,25 @@ def test_other_training_meshes_are_refused_before_anything_is_changed(finished, 
         train(config.model_copy(update={"data": fewer, "optim": optim}), finished)
     assert same_weights(finished, two_epochs) and (finished / METRICS).exists()
     assert read_run_config(finished) == config
+
+
+@pytest.mark.parametrize("word", ["variant=lstm", "data/remesh=mixed", "data/damage=scans"])
+def test_a_file_of_settings_that_contradicts_the_run_is_refused(two_epochs, word):
+    words = [f"resume={two_epochs}", word]
+    with pytest.raises(RunError, match=f"^{word} contradicts the run"):
+        resumed_config(composed(words), words)
+
+
+def test_another_trainer_changes_the_device_alone(toy_overrides, tmp_path):
+    """The command line's default number of epochs is another one, and does not count."""
+    stored = composed([*toy_overrides, "optim.epochs=66", "trainer.val_every=11"])
+    write_config(tmp_path, stored)
+    words = [f"resume={tmp_path}", "trainer=ddp", "trainer.devices=2"]
+    trainer = resumed_config(composed(words), words).trainer
+    device = {"accelerator": "auto", "devices": 2, "strategy": "ddp"}
+    assert trainer == stored.trainer.model_copy(update=device)
+    words = [f"resume={tmp_path}", "trainer.val_every=33"]
+    assert resumed_config(composed(words), words).trainer.val_every == 33
 
 
 @pytest.mark.parametrize("words", [[], ["optim.epochs=2"]])

@@ -22,7 +22,7 @@ from meshspiral.experiment.runs import (
     may_change,
     resumed_config,
 )
-from meshspiral.experiment.schema import TrainConfig
+from meshspiral.experiment.schema import TrainConfig, TrainerSettings
 
 log = logging.getLogger(__name__)
 
@@ -48,7 +48,7 @@ def main(config: TrainConfig) -> None:
     if lengths and "seq_len" not in type(config.neighbourhood).model_fields:
         log.info("%s: ignored, does not apply to %s", lengths[0], config.neighbourhood.name)
     in_sweep = hydra.mode == RunMode.MULTIRUN
-    separate = in_sweep and config.trainer.strategy != "auto"
+    separate = in_sweep and not is_one_process(config.trainer)
     try:
         with alone(folder) if is_first() else contextlib.nullcontext():
             if in_sweep and is_finished(folder, config):
@@ -57,7 +57,8 @@ def main(config: TrainConfig) -> None:
             if not separate:
                 train(config, folder)
         if separate:
-            train_separately(folder, [word for word in overrides if may_change(word, resumed=True)])
+            words = [word for word in overrides if may_change(word, resumed=True)]
+            train_separately(folder, [*words, *trainer_words(config.trainer)])
     except InUse:
         if not in_sweep:
             raise
@@ -68,6 +69,17 @@ def main(config: TrainConfig) -> None:
         resume = f"{command_line('train')} {shlex.quote(f'resume={folder}')}"
         message = "Stopped." if in_sweep else f"Stopped. To resume: {resume}"
         raise Stopped(stopped.signum, message) from None
+
+
+def is_one_process(trainer: TrainerSettings) -> bool:
+    """Whether Lightning certainly trains in this process alone."""
+    return trainer.strategy == "auto" and trainer.devices in (1, "1")
+
+
+def trainer_words(trainer: TrainerSettings) -> list[str]:
+    """The key=value words that set all of a trainer's settings, also those from a file."""
+    values = trainer.model_dump().items()
+    return [f"trainer.{key}={'null' if value is None else value}" for key, value in values]
 
 
 def is_finished(folder: Path, config: TrainConfig) -> bool:

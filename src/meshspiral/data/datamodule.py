@@ -156,12 +156,20 @@ class CorrespondenceData(L.LightningDataModule):
     def _in_order(self, split: str) -> DataLoader:
         """Every mesh once, divided among the processes."""
         rank, world = self._rank_and_world()
-        size = len(self.datasets[split])
-        if size < world:
-            raise DataError(
-                f"the split {split} must have a mesh for each of {world} processes, got {size}"
-            )
-        return self._loader(split, range(rank, size, world))
+        return self._loader(split, range(rank, len(self.datasets[split]), world))
+
+    def check_sizes(self, processes: int) -> None:
+        """Refuse splits that leave a process without a mesh.
+
+        Raises:
+            DataError: Validation or test has fewer meshes than there are processes.
+        """
+        for split in ("val", "test"):
+            if (size := len(self.datasets[split])) < processes:
+                raise DataError(
+                    f"the split {split} must have a mesh for each of {processes} processes, "
+                    f"got {size}"
+                )
 
     def _loader(self, split: str, sampler: Iterable[int]) -> DataLoader:
         dataset = self.datasets[split]

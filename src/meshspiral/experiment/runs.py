@@ -20,6 +20,7 @@ MAY_CHANGE = ("trainer", "data.cache_dir", "data.workers", "data.readers", "pict
 # what of a run itself may change when it is resumed: its length, and its start before it began
 OF_THE_RUN = ("optim.epochs", "init")
 FREE = (*OF_THE_RUN, *MAY_CHANGE)
+DEVICE = ("trainer.accelerator", "trainer.devices", "trainer.strategy")  # what trainer= changes
 
 log = logging.getLogger(__name__)
 
@@ -114,10 +115,11 @@ def resumed_config(config: TrainConfig, overrides: list[str]) -> TrainConfig:
     for key, override in zip(keys, overrides, strict=True):
         if key == "resume":
             continue
-        if key == "experiment":  # an experiment file may set anything
+        if key in ("experiment", "variant"):  # such a file may set anything
             contradicts = bool(different)
         else:
-            contradicts = any(f"{other}.".startswith(f"{key}.") for other in different)
+            group = key.replace("/", ".")  # data/remesh=mixed sets data.remesh
+            contradicts = any(f"{other}.".startswith(f"{group}.") for other in different)
         if contradicts:
             raise RunError(
                 f"{override} contradicts the run in {folder}; leave it out to resume the run, or "
@@ -130,6 +132,9 @@ def resumed_config(config: TrainConfig, overrides: list[str]) -> TrainConfig:
                 config.init,
                 folder,
             )
+        elif key == "trainer":  # the run keeps its precision, threads and validations
+            for part in DEVICE:
+                OmegaConf.update(result, part, _value(new, part))
         elif may_change(key, resumed=True):
             OmegaConf.update(result, key, _value(new, key))
     result.resume = None

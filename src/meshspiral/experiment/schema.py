@@ -58,7 +58,7 @@ class OptimSettings(Strict):
     schedule: Literal["cosine", "constant"] = Field(
         description="cosine: up to lr during `warmup`, then down to near 0; or constant"
     )
-    warmup: float = Field(ge=0, description="share of all steps before the rate is largest")
+    warmup: float = Field(ge=0, le=1, description="share of all steps before the rate is largest")
     soft_labels: float | None = Field(
         ge=0,
         description="width of a heat kernel that blurs the labels, over the square root of the "
@@ -77,9 +77,11 @@ class OptimSettings(Strict):
 class TrainerSettings(Strict):
     """Lightning's trainer."""
 
-    accelerator: str = Field(description="cpu, gpu, or auto: a GPU if there is one")
+    accelerator: Literal["cpu", "gpu", "auto"] = Field(
+        description="cpu, gpu, or auto: a GPU if there is one"
+    )
     devices: Any = Field(description="number of devices, their list, or auto")
-    strategy: str = Field(description="auto, or ddp for several devices")
+    strategy: Literal["auto", "ddp"] = Field(description="auto, or ddp for several devices")
     precision: Annotated[
         Literal["32", "64", "bf16", "auto"],
         BeforeValidator(lambda value: str(value) if isinstance(value, int) else value),
@@ -127,7 +129,8 @@ class TrainConfig(Strict):
                 f"neighbourhood.seq_len must be seq_len, {self.seq_len}, got {seq_len}; set "
                 f"seq_len={seq_len}"
             )
-        if self.trainer.val_every > self.optim.epochs:
+        # a run that is resumed may have other epochs than this command line, and is checked then
+        if self.resume is None and self.trainer.val_every > self.optim.epochs:
             raise ValueError(
                 f"trainer.val_every must be at most optim.epochs ({self.optim.epochs}), "
                 f"got {self.trainer.val_every}"

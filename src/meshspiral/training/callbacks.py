@@ -110,6 +110,14 @@ class Bar(ProgressBar):
             self._bar = None
 
 
+class ValidateLast(Callback):
+    """Validates after the last epoch, also where `trainer.val_every` does not divide the epochs."""
+
+    def on_train_epoch_start(self, trainer: L.Trainer, module: L.LightningModule) -> None:
+        if trainer.current_epoch == trainer.max_epochs - 1:
+            trainer.check_val_every_n_epoch = 1
+
+
 class Speed(Callback):
     """Logs training steps per second, without validation, and measures the training time.
 
@@ -147,7 +155,7 @@ class Speed(Callback):
 
     def on_train_epoch_end(self, trainer: L.Trainer, module: L.LightningModule) -> None:
         if self._busy > 0:
-            speed = self._steps / self._busy
+            speed = self._steps / trainer.accumulate_grad_batches / self._busy
             module.log("train/steps_per_second", speed, batch_size=1, sync_dist=True)
         self._steps, self._busy, self._ended = 0, 0.0, None
 

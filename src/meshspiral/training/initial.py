@@ -10,6 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from meshspiral.data.descriptors import Features
 from meshspiral.experiment.run_folder import BEST, CONFIG, RunError
 from meshspiral.experiment.schema import ConfigError, TrainConfig, flat, read_stored_config
 from meshspiral.geometry.mesh import Mesh
@@ -18,7 +19,6 @@ from meshspiral.training.module import Correspondence, build_network
 
 BUNDLED = "bundled"
 HEAD = "net.head."  # the last layer: one output for each vertex of the template
-GROUPS = {"model": True, "neighbourhood": True, "data": {"shot"}}  # what the weights depend on
 SAME = 1e-4  # largest difference of equal vertices, over the size of the template
 
 
@@ -40,7 +40,7 @@ class InitialWeights:
         self._saved = read_checkpoint(checkpoint_of(config.init))
         self._theirs = config_of(self._saved, self.source)
         self._config = config
-        theirs, ours = (flat(c.model_dump(include=GROUPS)) for c in (self._theirs, config))
+        theirs, ours = (_settings_of_weights(c) for c in (self._theirs, config))
         self._different = {
             key: (theirs.get(key), ours.get(key))
             for key in {**theirs, **ours}
@@ -49,10 +49,11 @@ class InitialWeights:
         for key in ("model.name", "neighbourhood.name"):
             if key in self._different:
                 raise self._misfit([key])
-        if self._saved["hyper_parameters"]["in_features"] != in_features:
-            descriptors = ["data.features", "data.shot.bins"]
-            known = [key for key in descriptors if key in self._different]
-            raise self._misfit(known or descriptors[-1:])
+        channels = self._saved["hyper_parameters"]["in_features"]
+        if channels != in_features:
+            descriptors = [key for key in self._different if key.startswith("data.")]
+            decisive = [key for key in descriptors if self._channels_with_theirs(key) == channels]
+            raise self._misfit(decisive or descriptors)
         if misfits := self._misfits(config, in_features):
             # the settings that alone, as there, would make more layers fit
             fewer = (
@@ -117,6 +118,10 @@ class InitialWeights:
         theirs = _shapes(self._saved["state_dict"])
         return sum(shapes.get(key) != theirs.get(key) for key in shapes.keys() | theirs.keys())
 
+    def _channels_with_theirs(self, key: str) -> int | None:
+        config = self._with_theirs(key)
+        return config and Features.of(config.data).channels
+
     def _with_theirs(self, key: str) -> TrainConfig | None:
         """Our config with one setting as in the other run; None if it cannot have it."""
         values: dict[str, Any] = self._config.model_dump()
@@ -155,6 +160,12 @@ def checkpoint_of(init: str) -> Path:
         what = "no epoch has finished" if (path / CONFIG).is_file() else "it is no run"
         raise RunError(f"init={init} has no {BEST}: {what}")
     return path / BEST
+
+
+def _settings_of_weights(config: TrainConfig) -> dict[str, Any]:
+    """The settings on which weights depend, by their keys."""
+    data = {"features", *config.data.features}
+    return flat(config.model_dump(include={"model": True, "neighbourhood": True, "data": data}))
 
 
 def _shapes(weights: dict[str, Tensor]) -> dict[str, torch.Size]:

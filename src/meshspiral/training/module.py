@@ -63,6 +63,11 @@ SAMPLES = 2048  # about so many vertices of all validation meshes fit the temper
 CHECK_EVERY = 10  # steps between two checks of the loss on a GPU, each of which waits for it
 
 
+def is_checked(device: str, batch: int, batches: int) -> bool:
+    """Whether a step reads its loss: on a GPU seldom, but always before a checkpoint."""
+    return device == "cpu" or batch % CHECK_EVERY == 0 or batch == batches - 1
+
+
 class Correspondence(L.LightningModule):
     """Trains with cross-entropy over the template's vertices and Adam; measures geodesic errors.
 
@@ -96,7 +101,9 @@ class Correspondence(L.LightningModule):
 
     def setup(self, stage: str) -> None:
         self.distances = self.trainer.datamodule.reference
-        if stage == "fit" and self.optim.soft_labels is not None:
+
+    def on_fit_start(self) -> None:  # after setup, when the module is on its device
+        if self.optim.soft_labels is not None:
             kernel = self.distances.heat_kernel(self.optim.soft_labels)
             self.soft_labels = SoftLabels(*(torch.from_numpy(x).to(self.device) for x in kernel))
 
@@ -123,8 +130,8 @@ class Correspondence(L.LightningModule):
             labels = Points(batch["corners"], batch["weights"])
         x = self.net.embed_batch(batch)
         loss = linear_cross_entropy(x, head.weight, head.bias, labels, self.soft_labels)
-        if self.device.type == "cpu" or batch_idx % CHECK_EVERY == 0:
-            self._check_finite(loss, batch_idx)
+        if is_checked(self.device.type, batch_idx, self.trainer.num_training_batches):
+            self._check_finite(loss.detach(), batch_idx)
         self.log("train/loss", loss, on_step=True, on_epoch=True, batch_size=1, sync_dist=True)
         return loss
 

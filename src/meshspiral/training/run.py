@@ -52,6 +52,7 @@ def train(config: TrainConfig, folder: Path) -> dict[str, float]:
     module = Correspondence(config.model_dump(), data.in_features, data.num_classes)
     speed = Speed()
     trainer = build_trainer(config, folder, speed)
+    data.check_sizes(trainer.world_size)
     parameters = sum(p.numel() for p in module.parameters() if p.requires_grad)
     for line in description_lines(config, data, parameters, trainer.precision, seconds):
         log.info(line)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import os
 import warnings
 from pathlib import Path
 
@@ -13,7 +14,7 @@ from lightning.pytorch.loggers import TensorBoardLogger
 from lightning.pytorch.utilities.exceptions import MisconfigurationException
 
 from meshspiral.experiment.schema import ConfigError, TrainConfig
-from meshspiral.training.callbacks import Bar, Figures, GracefulStop
+from meshspiral.training.callbacks import Bar, Figures, GracefulStop, ValidateLast
 from meshspiral.training.checkpoints import AtomicFiles, Checkpoint
 from meshspiral.training.device import choose_precision, set_up_process
 
@@ -33,6 +34,8 @@ def build_trainer(config: TrainConfig, folder: Path, *callbacks: Callback) -> L.
     auto = "cuda" if torch.cuda.is_available() else "cpu"
     accelerator = {"gpu": "cuda", "auto": auto}.get(asked.accelerator, asked.accelerator)
     set_up_process(asked.threads or torch.get_num_threads(), keep_memory=accelerator == "cpu")
+    if asked.threads and asked.strategy == "ddp":
+        os.environ["OMP_NUM_THREADS"] = str(asked.threads)  # else Lightning sets another number
     # `deterministic` below would also fill every new tensor with NaN, which costs time
     torch.utils.deterministic.fill_uninitialized_memory = False
     keep = {"dirpath": folder / "checkpoints", "enable_version_counter": False}
@@ -56,6 +59,7 @@ def build_trainer(config: TrainConfig, folder: Path, *callbacks: Callback) -> L.
                 Bar(),
                 Figures(),
                 GracefulStop(folder),
+                ValidateLast(),
                 LearningRateMonitor("step"),
                 Checkpoint(
                     filename="best", monitor="val/geodesic_error", save_weights_only=True, **keep

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from typing import Any
 
 import torch
-from pydantic import Field
+from pydantic import Field, field_validator
 from torch import Tensor, nn
 
 from meshspiral.nn.layers import METRIC_FEATURES, glorot
@@ -106,6 +106,13 @@ class ConvNet(OneLengthNet, name="conv"):
         widening: int = Field(ge=1, description="hidden channels of a layer per output channel")
         taps: int = Field(ge=1, description="length of the convolution's kernel, odd")
 
+        @field_validator("taps")
+        @classmethod
+        def _odd(cls, taps: int) -> int:
+            if taps % 2 == 0:
+                raise ValueError("must be odd")
+            return taps
+
     def __init__(
         self,
         in_features: int,
@@ -116,8 +123,6 @@ class ConvNet(OneLengthNet, name="conv"):
         taps: int = 3,
         **options: Any,
     ):
-        if taps % 2 == 0:
-            raise ValueError(f"model.taps must be odd, got {taps}")
         self.seq_len, self.widening, self.taps = seq_len, widening, taps
         super().__init__(in_features, num_classes, channels, **options)
 
