@@ -32,8 +32,8 @@ class ShotSettings(Strict):
     )
     bins: int = Field(ge=1, description="bins of the cosine; 16 give 544 channels")
     by_area: bool = Field(
-        description="weigh vertices by their areas instead of equally, as SHOT does; depends less "
-        "on the tessellation"
+        description="weigh vertices by area, which depends less on the tessellation; SHOT as "
+        "published weighs them equally"
     )
 
 
@@ -77,11 +77,11 @@ class DamageSettings(Strict):
     )
     share: float = Field(ge=0, le=1, description="share of the shapes that lose parts")
     cut: float = Field(ge=0, le=1, description="share of these that are cut by a plane")
-    holes: int = Field(ge=0, description="most holes in these")
+    holes: int = Field(ge=0, description="largest number of holes in these")
     hole_radius: float = Field(ge=0, description="largest radius of a hole")
-    missing: float = Field(ge=0, lt=1, description="most of their faces that miss, as a share")
+    missing: float = Field(ge=0, lt=1, description="largest share of their faces that is removed")
     size: float = Field(
-        ge=0, description="largest error of the size by which radii are scaled, as a share"
+        ge=0, description="largest relative error of the known size, by which radii are scaled"
     )
     seed: int = Field(ge=0, description="seed of the damage")
 
@@ -108,7 +108,7 @@ class DataSettings(Strict):
     readers: int | None = Field(
         ge=0,
         description="processes that read meshes ahead of the steps; null: one if the meshes do not "
-        "fit into half a gigabyte",
+        "fit into half a gigabyte, with fresh=true all cores but one",
     )
     workers: int | None = Field(
         ge=1, description="processes that compute descriptors and tables; null: one per core"

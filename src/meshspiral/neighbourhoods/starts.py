@@ -22,8 +22,8 @@ class StartSettings(Neighbourhood.Settings):
         gt=0, description="radius of that frame over the square root of the surface area"
     )
     by_area: bool = Field(
-        description="the frame weighs vertices by their areas instead of equally, as SHOT does; it "
-        "then depends less on the tessellation"
+        description="the frame weighs vertices by area, so it depends less on the tessellation; "
+        "SHOT as published weighs them equally"
     )
     jitter: int = Field(
         ge=0, description="start=frame: up to so many steps beside it in training, at random"
