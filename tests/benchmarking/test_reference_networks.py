@@ -23,9 +23,9 @@ def in_double(entry):
     return entry.double() if is_float else entry
 
 
-def network_and_batch(model):
+def network_and_batch(model, *more):
     """A small network without dropout, in float64, and a batch for it."""
-    small = [*SMALL[model], "seq_len=6", "data.shot.bins=1"]
+    small = [*SMALL[model], "seq_len=6", "data.shot.bins=1", *more]
     if model != "acnn":  # which has none
         small.append("model.dropout=0")
     config = composed([f"model={model}", *small])
@@ -33,6 +33,13 @@ def network_and_batch(model):
     batch = draw(Neighbourhood.of(config.neighbourhood), batch, 0)
     torch.manual_seed(0)
     return network_of(config, CLASSES).double(), in_double(batch)
+
+
+@pytest.mark.parametrize("model", ["fcs", "lstm"])
+def test_losses_with_metric_information_agree(model):
+    net, batch = network_and_batch(model, "metric=true")
+    ours, theirs = training_loss(net, batch), reference_loss(reference_network(net), batch)
+    torch.testing.assert_close(ours, theirs, rtol=0, atol=1e-9)
 
 
 @pytest.mark.parametrize("model", MODELS)

@@ -26,6 +26,14 @@ def test_both_tessellations_are_drawn(cli, toy_overrides, tmp_path):
     assert "around.v2.png" in out
 
 
+def test_a_set_without_test_shapes_can_be_drawn(cli, toy_overrides, tmp_path):
+    data = [o for o in toy_overrides if o.startswith("data") and "shot" not in o]
+    output = f"output={tmp_path / 'drawn'}"
+    code, _, err = cli(*data, "data.test=[]", output, "vertex=3", "seq_len=9", program=main)
+    assert code == 0, err
+    assert (tmp_path / "drawn.png").is_file()
+
+
 def test_both_neighbourhoods_start_where_the_frame_points(cli):
     code, out, _ = cli("--cfg", "job", program=main)
     drawn = OmegaConf.create(out).neighbourhoods

@@ -447,6 +447,16 @@ def test_votes_predict_from_several_draws_in_a_folder_of_their_own(cli, moved):
     assert "per mesh, 5 votes" in out
 
 
+def test_other_settings_of_the_data_get_a_folder_of_their_own(cli, moved):
+    folder, _ = moved
+    cli(f"run={folder}", "shapes=0", program=main)
+    before = (folder / "evaluation" / "folder" / METRICS).read_text()
+    code, _, err = cli(f"run={folder}", "shapes=0", "+data.shot.radius=0.1", program=main)
+    assert code == 0, err
+    assert (folder / "evaluation" / "folder" / METRICS).read_text() == before
+    assert len(list(folder.glob("evaluation/folder-*/metrics.json"))) >= 1
+
+
 @pytest.mark.parametrize("override", ["votes=2", "rotations=2"])
 def test_draws_that_are_not_random_cannot_vote(cli, moved, tmp_path, override):
     folder = tmp_path / "frame"

@@ -3,12 +3,16 @@
 import logging
 import multiprocessing
 import os
+import runpy
+import shutil
 import time
+from pathlib import Path
 
 import numpy as np
 import pytest
 from safetensors.numpy import save
 
+from meshspiral import geometry
 from meshspiral.data.cache import Cache, CacheError, code_version, digest
 from meshspiral.data.descriptors.shot import Shot
 from meshspiral.data.preprocessing import Task, descriptor_task, neighbourhood_task, run_tasks
@@ -235,6 +239,23 @@ def test_the_code_version_depends_on_the_source(tmp_path, monkeypatch):
     assert versions[0] != versions[1]
 
 
+def test_compiled_code_is_kept_apart_for_other_sources(tmp_path, monkeypatch):
+    """Numba itself does not notice a change in a function that another file calls."""
+    package, folders = Path(geometry.__file__).parent, []
+    for change in ("", "# changed\n"):
+        copy = shutil.copytree(package, tmp_path / f"geometry{len(change)}")
+        with open(copy / "angles.py", "a") as file:
+            file.write(change)
+        runpy.run_path(str(copy / "__init__.py"))
+        folders.append(os.environ["NUMBA_CACHE_DIR"])
+    assert folders[0] != folders[1]
+    monkeypatch.setenv("NUMBA_CACHE_DIR", "/mine")
+    runpy.run_path(str(package / "__init__.py"))
+    assert os.environ["NUMBA_CACHE_DIR"] == "/mine"
+    monkeypatch.undo()
+    runpy.run_path(str(package / "__init__.py"))
+
+
 def test_the_code_version_depends_on_the_geometry_that_a_module_imports(monkeypatch):
     import inspect
 
@@ -263,6 +284,25 @@ def test_results_that_another_process_saved_meanwhile_are_not_computed_again(tmp
 
     run_tasks([Task("toys", key, compute, (key,)) for key in "abc"], cache, 1, "Preparing")
     assert len(done) == 1
+
+
+def test_looking_for_damage_is_not_reading(cache):
+    cache.save("kind", "a", {"x": np.zeros(100)})
+    os.utime(cache.path("kind", "a"), (1e9, 1e9))
+    assert list(cache.damaged()) == []
+    assert [entry.read for entry in cache.entries()] == [1e9]
+
+
+def test_what_a_killed_process_left_goes_after_a_day(cache):
+    cache.save("kind", "a", {"x": np.zeros(100)})
+    size = cache.size()
+    left = [cache.path("kind", "a").with_name(f"a.safetensors.{i}.tmp") for i in range(2)]
+    for path in left:
+        path.write_bytes(bytes(10))
+    os.utime(left[0], (1e9, 1e9))
+    assert cache.size() == size + 20
+    assert [entry.path for entry in cache.prune(None, None)] == [left[0]]
+    assert cache.size() == size + 10
 
 
 def test_what_was_read_last_stays(cache):

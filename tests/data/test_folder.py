@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import trimesh
 import yaml
 
 from meshspiral.data.datasets.folder import Folder
@@ -44,6 +45,21 @@ def test_meshes_come_with_the_labels_of_their_files(root):
     assert shape.mesh.vertices[3, 2] == 3
     assert shape.labels.tolist() == [2, 1, 2, 4] and shape.labels.dtype == np.int64
     assert shape.template_size == 5
+
+
+def test_meshes_that_are_inside_out_are_turned(root):
+    """As `match` does, so that a network knows the orientation that it will see."""
+    for name in ("template", "a/0"):
+        file = root / f"{name}.off"
+        mesh = trimesh.load(file, process=False)
+        file.write_text(
+            trimesh.Trimesh(mesh.vertices, mesh.faces[:, ::-1], process=False).export(
+                file_type="off"
+            )
+        )
+    data = folder(root, train=["a/0.off", "a/1.off"])
+    for mesh in (data.template, data.load("a_0").mesh, data.load("a_1").mesh):
+        assert trimesh.Trimesh(mesh.vertices, mesh.faces, process=False).volume > 0
 
 
 def test_files_are_sorted_within_a_pattern_and_never_repeated(root):

@@ -7,9 +7,10 @@ import pytest
 
 from meshspiral.data.damaged import Damaged
 from meshspiral.data.dataset import EpochSampler
+from meshspiral.data.datasets.bodies import Bodies
 from meshspiral.data.settings import DamageSettings
 from meshspiral.data.shapes import DataError, epoch_of, name_in
-from meshspiral.data.sources import open_data
+from meshspiral.data.sources import open_data, open_shapes
 from tests.data.test_datamodule import Toy
 from tests.helpers import composed, run, same_weights
 
@@ -70,3 +71,12 @@ def test_fresh_runs_agree_and_differ_from_others(toy_overrides, tmp_path):
     assert same_weights(tmp_path / "one", tmp_path / "two")
     run(tmp_path / "same", [*words, "data.fresh=false"])
     assert not same_weights(tmp_path / "one", tmp_path / "same")
+
+
+@pytest.mark.parametrize("name", ["anna@home", "anna~2"])
+def test_names_that_look_like_epochs_or_copies_are_refused(monkeypatch, name):
+    monkeypatch.setattr(
+        Bodies, "__init__", lambda self, vertices: setattr(self, "names", {"test": [name]})
+    )
+    with pytest.raises(DataError, match=f"must be without '@' and '~', got '{name}'"):
+        open_shapes(composed([]).data)

@@ -49,15 +49,15 @@ def test_all_rows_can_be_computed_before(reference, monkeypatch):
     assert (again(np.arange(642), np.roll(np.arange(642), 1)) > 0).all()
 
 
-def test_the_rows_in_memory_are_bounded(reference, monkeypatch):
-    monkeypatch.setattr("meshspiral.data.reference.IN_MEMORY", 1)
+def test_rows_are_mapped_files_that_are_opened_once(reference, monkeypatch):
     rng = np.random.default_rng(1)
     sources, targets = rng.integers(0, 642, (2, 50))
-    bounded = reference(sources, targets)
-    assert len(reference._blocks) == 1
-    monkeypatch.setattr("meshspiral.data.reference.IN_MEMORY", 2**30)
-    np.testing.assert_array_equal(reference(sources, targets), bounded)
+    first = reference(sources, targets)
     assert len(reference._blocks) == 3
+    for rows in reference._blocks.values():
+        assert not rows.flags.owndata  # not what was computed: that of the file
+    monkeypatch.setattr(Cache, "load", None)
+    np.testing.assert_array_equal(reference(sources, targets), first)
 
 
 def test_a_pair_on_two_components_counts_as_the_diameter(tmp_path):

@@ -167,6 +167,14 @@ def test_later_epochs_have_other_tessellations_of_the_same_shape(tmp_path, share
         assert off.max() < 0.05
 
 
+def test_a_load_makes_the_original_shape_once(tmp_path, monkeypatch):
+    shapes, made = Remeshed(Toys(), Cache(tmp_path), 1, "isotropic", 120), []
+    load = Toys.load
+    monkeypatch.setattr(Toys, "load", lambda self, name: made.append(name) or load(self, name))
+    shapes.load("train/0.ply")
+    assert made == ["train/0.ply"]
+
+
 def test_training_shapes_can_have_several_tessellations(tmp_path):
     shapes = Remeshed(Toys(), Cache(tmp_path), 1, "isotropic", 120, copies=3)
     names = ["train/0.ply", "train/0.ply~2", "train/0.ply~3"]

@@ -60,6 +60,13 @@ def test_genus_is_summed_over_components_and_undefined_with_a_boundary():
     assert not statistics(bow_tie()).manifold
 
 
+def test_vertices_on_no_face_are_no_components():
+    sphere = bumpy_sphere()
+    isolated = Mesh(np.concatenate([sphere.vertices, [[5, 0, 0], [6, 0, 0]]]), sphere.faces)
+    found = statistics(isolated)
+    assert (found.components, found.closed, found.genus) == (1, True, 0)
+
+
 def test_the_hausdorff_distance_of_parallel_sheets_and_of_a_part():
     sheet = lattice(4, 4)
     lifted = Mesh(sheet.vertices + np.array([0, 0, 0.25]), sheet.faces)

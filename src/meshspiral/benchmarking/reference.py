@@ -23,7 +23,7 @@ def reference_network(net: Network) -> Network:
     alone, the reference differs in the cross-entropy only.
 
     Args:
-        net: A network without metric information.
+        net: A network whose sequences, if it reads any, are without padding.
     """
     reference = copy.deepcopy(net)
     for name, layer in net.named_modules():
@@ -42,10 +42,11 @@ class ReferenceSpiralLinear(nn.Module):
 
     def __init__(self, layer: SpiralLinear):
         super().__init__()
-        self.linear = copy.deepcopy(layer.linear)
+        self.linear, self.metric = copy.deepcopy(layer.linear), copy.deepcopy(layer.metric)
 
-    def forward(self, x: Tensor, spirals: Tensor, metric: None = None) -> Tensor:
-        return self.linear(x[spirals].flatten(1))
+    def forward(self, x: Tensor, spirals: Tensor, metric: Tensor | None = None) -> Tensor:
+        out = self.linear(x[spirals].flatten(1))
+        return out if self.metric is None else out + self.metric(metric.flatten(1))
 
 
 class ReferenceSpiralLSTM(nn.Module):
@@ -54,7 +55,10 @@ class ReferenceSpiralLSTM(nn.Module):
     def __init__(self, layer: SpiralLSTM):
         super().__init__()
         weight = layer.input.weight
-        sizes = layer.input.in_features, layer.hidden.in_features
+        if layer.metric is not None:
+            weight = torch.cat([weight, layer.metric.weight], dim=1)
+        self.metric = layer.metric is not None
+        sizes = weight.shape[1], layer.hidden.in_features
         self.lstm = nn.LSTM(*sizes, batch_first=True, device=weight.device, dtype=weight.dtype)
         with torch.no_grad():
             self.lstm.weight_ih_l0.copy_(weight)
@@ -62,8 +66,11 @@ class ReferenceSpiralLSTM(nn.Module):
             self.lstm.bias_ih_l0.copy_(layer.input.bias)
             self.lstm.bias_hh_l0.zero_()
 
-    def forward(self, x: Tensor, spirals: Tensor, metric: None = None) -> Tensor:
-        return self.lstm(x[spirals])[1][0][0]
+    def forward(self, x: Tensor, spirals: Tensor, metric: Tensor | None = None) -> Tensor:
+        sequences = x[spirals]
+        if self.metric:
+            sequences = torch.cat([sequences, metric.to(x.dtype)], dim=2)
+        return self.lstm(sequences)[1][0][0]
 
 
 class ReferenceGeodesicConv(nn.Module):

@@ -35,7 +35,8 @@ def main(config: BenchmarkConfig) -> None:
     }
     folder = Path(HydraConfig.get().runtime.output_dir)
     networks = network_configs(config)
-    device_of(config.accelerator)
+    if device_of(config.accelerator) != "cpu" and config.parts != ["steps"]:
+        raise ConfigError("accelerator=gpu measures steps alone: add 'parts=[steps]'")
     set_up_process(config.threads, keep_memory=True)  # ours and the reference alike, as in training
     result = {"machine": machine(), "config": config.model_dump()}
     log.info("%s", ", ".join(f"{key} {value}" for key, value in result["machine"].items()))

@@ -24,7 +24,9 @@ def main(config: DrawConfig) -> None:
 
     shapes = open_shapes(config.data)
     names = [name for split in shapes.names.values() for name in split]
-    name = config.shape or shapes.names["test"][0]
+    if not names:
+        raise ConfigError("the data set has no shape to draw")
+    name = config.shape or next(iter(shapes.names["test"]), names[0])
     if name not in names:
         raise ConfigError(f"shape must be a shape of the data set, got {name}; see src.meshes")
     count = len(shapes.template.vertices)

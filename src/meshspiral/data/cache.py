@@ -8,6 +8,7 @@ import inspect
 import logging
 import os
 import sys
+import time
 import zlib
 from collections.abc import Callable, Iterator
 from functools import cache
@@ -25,6 +26,8 @@ from meshspiral.neighbourhoods.base import Arrays
 
 log = logging.getLogger(__name__)
 SUFFIX = ".safetensors"
+TEMPORARY = ".tmp"  # of `atomic_file`; a killed process leaves it
+A_DAY = 86400.0
 FOLLOWED = ("meshspiral.geometry", "meshspiral.data.datasets")
 
 
@@ -90,7 +93,7 @@ class Cache:
         """Whether there is a file for a result; its content is not checked."""
         return self.path(kind, key).is_file()
 
-    def load(self, kind: str, key: str, check: bool = True) -> Arrays | None:
+    def load(self, kind: str, key: str, check: bool = True, read: bool = True) -> Arrays | None:
         """Load the arrays of a result; None if its file is missing, damaged or foreign.
 
         The file is mapped into memory: its pages are read when they are used, and processes of one
@@ -101,6 +104,7 @@ class Cache:
             key: Its key.
             check: Read everything and compare it with its checksum. Otherwise a file that is too
                 short, or not a result of this name, is still recognised.
+            read: Whether this counts as the last time that the result was read, see `prune`.
         """
         path = self.path(kind, key)
         try:
@@ -116,8 +120,9 @@ class Cache:
         if check and about.get("crc32") != _checksum(arrays):
             log.warning("%s is damaged (wrong checksum); computing it again", path)
             return None
-        with contextlib.suppress(OSError):  # in a folder of somebody else
-            os.utime(path)
+        if read:
+            with contextlib.suppress(OSError):  # in a folder of somebody else
+                os.utime(path)
         return arrays
 
     def save(self, kind: str, key: str, arrays: Arrays) -> None:
@@ -168,7 +173,7 @@ class Cache:
         """All files of the cache."""
         found = []
         for path in self.root.glob("*/*"):
-            if path.suffix in (SUFFIX, ".json"):
+            if path.suffix in (SUFFIX, ".json", TEMPORARY):
                 with contextlib.suppress(OSError):  # another process is replacing it
                     status = path.stat()
                     found.append(Entry(path, status.st_size, status.st_mtime))
@@ -182,11 +187,11 @@ class Cache:
         """The files whose content does not agree with their checksum; each is read."""
         for entry in self.entries():
             kind, key = entry.path.parent.name, entry.path.stem
-            if entry.path.suffix == SUFFIX and self.load(kind, key) is None:
+            if entry.path.suffix == SUFFIX and self.load(kind, key, read=False) is None:
                 yield entry
 
     def prune(self, most: float | None, since: float | None) -> list[Entry]:
-        """Remove the files whose last reading is longest ago.
+        """Remove the files whose last reading is longest ago, and what killed processes left.
 
         Args:
             most: Bytes that may stay; None for any number.
@@ -198,8 +203,14 @@ class Cache:
         """
         removed, size = [], 0
         for entry in sorted(self.entries(), key=lambda entry: -entry.read):
-            size += entry.size
-            if (most is not None and size > most) or (since is not None and entry.read < since):
+            if entry.path.suffix == TEMPORARY:
+                if entry.read > time.time() - A_DAY:
+                    continue  # another process may be writing it
+                old = True
+            else:
+                size += entry.size
+                old = since is not None and entry.read < since
+            if old or (most is not None and size > most):
                 with contextlib.suppress(FileNotFoundError):
                     entry.path.unlink()
                 removed.append(entry)

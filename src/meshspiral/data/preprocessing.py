@@ -7,6 +7,7 @@ import sys
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from functools import partial
+from importlib import metadata
 from types import ModuleType
 
 import numpy as np
@@ -20,6 +21,9 @@ from meshspiral.geometry.digest import digest
 from meshspiral.geometry.mesh import Mesh, MeshError
 from meshspiral.geometry.shot import Frame
 from meshspiral.neighbourhoods import Neighbourhood
+
+# libraries whose versions geodesics and Laplacians depend on
+LIBRARIES = [f"{name} {metadata.version(name)}" for name in ("potpourri3d", "scipy")]
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,6 +68,7 @@ def _descriptor_key(mesh: Mesh, descriptor: Descriptor, *more: str) -> str:
         mesh.faces,
         mesh.complete_area,
         code_version(*descriptor.modules, *sources(descriptor), meshes, sys.modules[__name__]),
+        *LIBRARIES,
     )
 
 
@@ -72,7 +77,7 @@ def neighbourhood_task(mesh: Mesh, neighbourhood: Neighbourhood) -> Task:
     modules = (*neighbourhood.modules, *sources(neighbourhood), meshes, sys.modules[__name__])
     version = code_version(*modules)
     settings = sorted(neighbourhood.settings.model_dump().items())
-    key = digest(repr(settings), *neighbourhood.mesh_key(mesh), version)
+    key = digest(repr(settings), *neighbourhood.mesh_key(mesh), version, *LIBRARIES)
     inputs = _inputs(neighbourhood, mesh)
     return Task(neighbourhood.name, key, neighbourhood.compute, inputs)
 

@@ -16,7 +16,6 @@ from meshspiral.geometry.digest import digest
 from meshspiral.geometry.mesh import Mesh
 
 BLOCK = 256  # rows per cached file
-IN_MEMORY = 2**30  # bytes of rows held in memory; enough for all rows up to 16,000 vertices
 
 
 class ReferenceDistances:
@@ -113,10 +112,10 @@ class ReferenceDistances:
     def _block(self, block: int) -> np.ndarray:
         if block not in self._blocks:
             key, compute = f"{self._key}-{block}", partial(self._compute, block)
-            rows = self._cache.get("distances", key, compute)["distances"]
-            if (len(self._blocks) + 1) * rows.nbytes > IN_MEMORY and self._blocks:
-                del self._blocks[next(iter(self._blocks))]
-            self._blocks[block] = rows
+            rows = self._cache.get("distances", key, compute)
+            # as a mapped file, so that the system may drop its pages
+            rows = self._cache.load("distances", key, check=False) or rows
+            self._blocks[block] = rows["distances"]
         return self._blocks[block]
 
     def _compute(self, block: int) -> dict[str, np.ndarray]:

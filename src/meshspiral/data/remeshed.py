@@ -92,7 +92,7 @@ class Remeshed(ShapeSet):
 
     def load(self, name: str) -> Shape:
         source = self.source(name)
-        pattern, task = self._tessellation(name)
+        pattern, task = self._tessellation(name, source)
         arrays = load_task(task, self._cache)
         if pattern is not None and not np.array_equal(pattern.mesh.faces, source.mesh.faces):
             raise DataError(
@@ -148,12 +148,16 @@ class Remeshed(ShapeSet):
             return None
         return self._shared[derived_seed("tessellation", name) % len(self._shared)]
 
-    def _tessellation(self, name: str) -> tuple[Shape | None, Task]:
-        """The shape whose tessellation a shape shares, None if it has its own; and its task."""
+    def _tessellation(self, name: str, source: Shape | None = None) -> tuple[Shape | None, Task]:
+        """The shape whose tessellation a shape shares, None if it has its own; and its task.
+
+        `source` is the original shape, where it is known already: Anny makes each anew.
+        """
         if shared := self._pattern(name):
             pattern = self.base.load(shared)
             return pattern, self._task(pattern.mesh, 1)
-        return None, self._task(self.source(name).mesh, self._original(name)[1])
+        source = source or self.source(name)
+        return None, self._task(source.mesh, self._original(name)[1])
 
     def _task(self, source: Mesh, copy: int) -> Task:
         content = (source.vertices, source.faces, self._policy, *([copy] if copy > 1 else []))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from itertools import chain
 from typing import Any
 
 import meshspiral.data.datasets  # noqa: F401  registers the data sets
@@ -12,7 +13,7 @@ from meshspiral.data.descriptors import Features
 from meshspiral.data.fitting import fitted_features
 from meshspiral.data.remeshed import Remeshed
 from meshspiral.data.settings import DataSettings
-from meshspiral.data.shapes import ShapeSet
+from meshspiral.data.shapes import DataError, ShapeSet
 from meshspiral.neighbourhoods import Neighbourhood
 
 
@@ -24,6 +25,9 @@ def open_shapes(settings: DataSettings) -> ShapeSet:
         MeshError: A mesh cannot be used.
     """
     shapes = ShapeSet.registered[settings.name](**settings.own())
+    for name in chain(*shapes.names.values()):
+        if "@" in name or "~" in name:  # these mark epochs and copies
+            raise DataError(f"the name of a shape must be without '@' and '~', got {name!r}")
     if settings.remesh is not None:
         cache = Cache(settings.cache_dir)
         shapes = Remeshed(shapes, cache, settings.workers, **settings.remesh.model_dump())

@@ -14,7 +14,7 @@ from meshspiral.data.shapes import Shape, ShapeSet
 from meshspiral.geometry.barycentric import interpolate
 from meshspiral.geometry.connectivity import fans
 from meshspiral.geometry.faces import directed_edges
-from meshspiral.geometry.mesh import Mesh
+from meshspiral.geometry.mesh import Mesh, used_vertices
 from meshspiral.geometry.remesh import closest_points
 
 
@@ -127,7 +127,9 @@ def labelled_edges(shape: Shape) -> set[tuple[int, int]]:
 
 
 def _solid(mesh: Mesh) -> trimesh.Trimesh:
-    return trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
+    """The mesh without vertices on no face, which trimesh would count as components."""
+    used, faces = used_vertices(mesh.faces)
+    return trimesh.Trimesh(mesh.vertices[used], faces, process=False)
 
 
 def _topology(solid: trimesh.Trimesh) -> tuple[int, bool, int | None]:

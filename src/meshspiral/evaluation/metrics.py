@@ -74,22 +74,6 @@ def point_errors(
     return error
 
 
-def correspondence_curve(errors: np.ndarray, thresholds: np.ndarray = THRESHOLDS) -> np.ndarray:
-    """The share of errors up to each threshold (Kim et al. 2011).
-
-    Args:
-        errors: float [V].
-        thresholds: float [T], ascending. They are inclusive: the value at 0 is the exact-match
-            rate.
-
-    Returns:
-        float64 [T]; NaN if there are no errors.
-    """
-    if len(errors) == 0:
-        return np.full(len(thresholds), np.nan)
-    return _counts(errors, thresholds) / len(errors)
-
-
 def _counts(errors: np.ndarray, thresholds: np.ndarray) -> np.ndarray:
     """The number of errors up to each threshold, int64 [T]."""
     return np.searchsorted(np.sort(errors), thresholds, side="right")

@@ -42,6 +42,8 @@ from meshspiral.nn.loss import Prediction
 from meshspiral.viz.plots import all_curves_figure, encoded
 
 KINDS = ("png", "pdf", "svg")  # of a plot
+# data settings that do not change what an evaluation measures
+SAME = {"cache_dir", "workers", "readers", "fresh"}
 PLOTS = (
     "errors.png",
     "correspondence.png",
@@ -202,7 +204,6 @@ def create_folder(
     run: Path,
     config: TrainConfig,
     trained: TrainConfig,
-    requested: dict[str, Any],
     votes: int = 1,
 ) -> Path:
     """Create the folder of an evaluation, or remove the plots of an earlier one.
@@ -211,16 +212,15 @@ def create_folder(
         run: The run folder.
         config: From `config_on_data`.
         trained: The config of the run.
-        requested: The data settings that the user gave.
         votes: Number of draws that vote.
 
     Returns:
-        <run>/evaluation/<name of the data set>; with a hash of its settings if another data set
-        than the run's own was requested, and with the number of votes if there are several.
+        <run>/evaluation/<name of the data set>; with a hash of its settings if they are not the
+        run's own, and with the number of votes if there are several.
     """
-    data, own = (c.data.model_dump(exclude={"cache_dir", "workers"}) for c in (config, trained))
+    data, own = (c.data.model_dump(exclude=SAME) for c in (config, trained))
     name = config.data.name
-    if "name" in requested and data != own:
+    if data != own:
         name += f"-{digest(json.dumps(data, sort_keys=True))[:8]}"
     if votes > 1:
         name += f"-votes{votes}"

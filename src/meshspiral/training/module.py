@@ -162,7 +162,8 @@ class Correspondence(L.LightningModule):
         if split == "val":
             meshes = sum(self.trainer.num_val_batches) * self.trainer.world_size
             step = math.ceil(meshes * len(labels) / SAMPLES)
-            self._samples.append((x[::step].cpu(), labels[::step].cpu()))
+            # copies: views would keep a file open for each mesh that a reader process sent
+            self._samples.append((x[::step].cpu(), labels[::step].clone().cpu()))
         predicted = found.classes.cpu().numpy()
         self.log(f"{split}/loss", found.loss, batch_size=1, sync_dist=True)
         result = result_of(predicted, batch, self.distances)

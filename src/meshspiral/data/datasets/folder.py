@@ -21,6 +21,7 @@ from meshspiral.data.shapes import (
     registered_shape,
 )
 from meshspiral.geometry.mesh import Mesh
+from meshspiral.geometry.repair import outwards
 
 
 def _files(value: Any) -> Any:
@@ -111,12 +112,13 @@ class Folder(ShapeSet, name="folder"):
 
     @cached_property
     def template(self) -> Mesh:
-        return read_mesh(self._template)
+        return outwards(read_mesh(self._template))[0]
 
     def load(self, name: str) -> Shape:
         if name not in self._meshes:
             raise DataError(f"no mesh is named {name!r}; the first is {next(iter(self._meshes))}")
-        mesh, labels = read_mesh(self._meshes[name]), self._labels[name]
+        mesh, _ = outwards(read_mesh(self._meshes[name]))  # as `match` reads it
+        labels = self._labels[name]
         if labels is None:
             return registered_shape(mesh, self.template)
         read = read_labels(labels, len(mesh.vertices))
