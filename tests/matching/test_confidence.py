@@ -67,6 +67,17 @@ def test_a_point_between_vertices_is_their_mean_by_probability():
     assert np.isnan(points[2]).all()
 
 
+def test_points_do_not_depend_on_the_temperature():
+    """Which calibrates the probabilities of single vertices."""
+    inside, beside = SIZE // 2, SIZE // 2 + 1
+    found = distributions(0.6 * one_hot(inside) + 0.4 * one_hot(beside))
+    sharper = found._replace(weight=found.weight / 0.5, bias=found.bias / 0.5, temperature=0.5)
+    assert sharper.rows(np.array([0]))[0, inside] == pytest.approx(0.36 / 0.52)
+    labels = np.array([inside])
+    points = (soft_points(each, labels, NEAR, TEMPLATE.vertices) for each in (found, sharper))
+    np.testing.assert_allclose(next(points), next(points), rtol=1e-9)
+
+
 def test_a_label_that_the_network_rules_out_stays_at_its_vertex():
     found = distributions(one_hot(0))
     points = soft_points(found, np.array([SIZE // 2]), NEAR, TEMPLATE.vertices)

@@ -31,6 +31,7 @@ class Distributions(NamedTuple):
         side: int8 [W], the side of the template where a vertex is known to belong: 1, -1, or 0 for
             not known. The probabilities are those under that condition.
         sides: int8 [K], the side of each template vertex, 0 on the mirror; required with `side`.
+        temperature: By which the scores of the last layer are divided in `weight` and `bias`.
     """
 
     embedding: Tensor
@@ -39,16 +40,24 @@ class Distributions(NamedTuple):
     row_of: np.ndarray
     side: np.ndarray | None = None
     sides: np.ndarray | None = None
+    temperature: float = 1.0
 
-    def rows(self, rows: np.ndarray) -> np.ndarray:
-        """Probabilities of the template's vertices, float [R, K], for some rows [R]."""
-        return np.exp(self.log_rows(rows))
+    def rows(self, rows: np.ndarray, as_trained: bool = False) -> np.ndarray:
+        """Probabilities of the template's vertices, float [R, K], for some rows [R].
+
+        Args:
+            rows: int [R].
+            as_trained: Without the temperature.
+        """
+        return np.exp(self.log_rows(rows, as_trained))
 
     @torch.inference_mode()
-    def log_rows(self, rows: np.ndarray) -> np.ndarray:
+    def log_rows(self, rows: np.ndarray, as_trained: bool = False) -> np.ndarray:
         """Their logarithms, float [R, K]; -inf on the other side of the template."""
         x = self.embedding[torch.from_numpy(rows).to(self.embedding.device)]
         scores = torch.addmm(self.bias, x.to(self.weight.dtype), self.weight.T)
+        if as_trained:
+            scores *= self.temperature
         if self.side is not None:
             other = torch.from_numpy(self.side[rows, None] * self.sides < 0)
             scores = scores.masked_fill(other.to(scores.device), -torch.inf)
@@ -85,7 +94,9 @@ def soft_points(
 ) -> np.ndarray:
     """The mean of the template's vertices near each label, by their predicted probabilities.
 
-    A mesh that is denser than the template thus gets points between the template's vertices.
+    A mesh that is denser than the template thus gets points between the template's vertices. The
+    probabilities are those of the network as trained: a network that learnt barycentric coordinates
+    as labels predicts these, and a temperature that calibrates single vertices would sharpen them.
 
     Args:
         found: Of V vertices.
@@ -100,7 +111,9 @@ def soft_points(
     known = np.flatnonzero((template >= 0) & (found.row_of >= 0))
     for begin in range(0, len(known), PAIRS):
         chunk = known[begin : begin + PAIRS]
-        weights = near[template[chunk]].multiply(found.rows(found.row_of[chunk])).tocsr()
+        weights = (
+            near[template[chunk]].multiply(found.rows(found.row_of[chunk], as_trained=True)).tocsr()
+        )
         total = weights.sum(axis=1)[:, None]
         mean = (weights @ vertices) / np.maximum(total, TINY)
         points[chunk] = np.where(total > TINY, mean, vertices[template[chunk]])

@@ -339,7 +339,8 @@ class Matcher:
             report("ensemble")
             embedding = self._with_copies(mesh, embedding)
         everything = np.arange(len(embedding))
-        found = Distributions(embedding, *self._predictor.head, everything)
+        temperature = self._predictor.temperature
+        found = Distributions(embedding, *self._predictor.head, everything, temperature=temperature)
         template = self._predictor.predict(embedding).classes.cpu().numpy()
         flipped = np.zeros(len(template), dtype=bool)
         if self._refine is not None:

@@ -29,6 +29,9 @@ class Predictor:
         votes: Number of draws of the neighbourhoods; the mean of their log-probabilities decides.
         calibrated: Divide scores by the checkpoint's temperature, if it has one.
 
+    Attributes:
+        temperature: By which scores are divided.
+
     Raises:
         RunError: The weights do not fit the config.
         ConfigError: There is no GPU.
@@ -54,7 +57,7 @@ class Predictor:
             raise RunError("the checkpoint's weights do not fit its config") from error
         dtype = torch.float64 if self.precision == "64-true" else torch.float32
         self.module.to(self.device, dtype).eval()
-        self._temperature = saved.get("temperature", 1.0) if calibrated else 1.0
+        self.temperature = saved.get("temperature", 1.0) if calibrated else 1.0
 
     def __call__(self, batch: Batch, purpose: str) -> Prediction:
         """Predict a vertex of the template for each vertex of a mesh.
@@ -68,7 +71,8 @@ class Predictor:
     def distributions(self, batch: Batch, purpose: str) -> Distributions:
         """Predict a distribution over the template's vertices; arguments as above."""
         mean = torch.stack(self._embeddings(batch, purpose)).mean(0)  # the last layer is linear
-        return Distributions(mean, *self.head, np.arange(len(mean)))
+        rows = np.arange(len(mean))
+        return Distributions(mean, *self.head, rows, temperature=self.temperature)
 
     def _embeddings(self, batch: Batch, purpose: str) -> list[Tensor]:
         purposes = [(purpose,), *((purpose, "vote", k) for k in range(1, self.votes))]
@@ -107,4 +111,4 @@ class Predictor:
     def head(self) -> tuple[Tensor, Tensor]:
         """Weight [K, C] and bias [K] of the last layer, over the temperature."""
         head = self.module.net.head
-        return head.weight.detach() / self._temperature, head.bias.detach() / self._temperature
+        return head.weight.detach() / self.temperature, head.bias.detach() / self.temperature
