@@ -67,8 +67,8 @@ def test_a_point_between_vertices_is_their_mean_by_probability():
     assert np.isnan(points[2]).all()
 
 
-def test_points_do_not_depend_on_the_temperature():
-    """Which calibrates the probabilities of single vertices."""
+def test_a_temperature_does_not_sharpen_points():
+    """It calibrates the probabilities of single vertices."""
     inside, beside = SIZE // 2, SIZE // 2 + 1
     found = distributions(0.6 * one_hot(inside) + 0.4 * one_hot(beside))
     sharper = found._replace(weight=found.weight / 0.5, bias=found.bias / 0.5, temperature=0.5)

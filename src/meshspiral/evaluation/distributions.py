@@ -42,21 +42,21 @@ class Distributions(NamedTuple):
     sides: np.ndarray | None = None
     temperature: float = 1.0
 
-    def rows(self, rows: np.ndarray, as_trained: bool = False) -> np.ndarray:
+    def rows(self, rows: np.ndarray, sharpened: bool = True) -> np.ndarray:
         """Probabilities of the template's vertices, float [R, K], for some rows [R].
 
         Args:
             rows: int [R].
-            as_trained: Without the temperature.
+            sharpened: Whether a temperature below 1 counts, which makes them sharper than trained.
         """
-        return np.exp(self.log_rows(rows, as_trained))
+        return np.exp(self.log_rows(rows, sharpened))
 
     @torch.inference_mode()
-    def log_rows(self, rows: np.ndarray, as_trained: bool = False) -> np.ndarray:
+    def log_rows(self, rows: np.ndarray, sharpened: bool = True) -> np.ndarray:
         """Their logarithms, float [R, K]; -inf on the other side of the template."""
         x = self.embedding[torch.from_numpy(rows).to(self.embedding.device)]
         scores = torch.addmm(self.bias, x.to(self.weight.dtype), self.weight.T)
-        if as_trained:
+        if not sharpened and self.temperature < 1:
             scores *= self.temperature
         if self.side is not None:
             other = torch.from_numpy(self.side[rows, None] * self.sides < 0)
@@ -94,9 +94,9 @@ def soft_points(
 ) -> np.ndarray:
     """The mean of the template's vertices near each label, by their predicted probabilities.
 
-    A mesh that is denser than the template thus gets points between the template's vertices. The
-    probabilities are those of the network as trained: a network that learnt barycentric coordinates
-    as labels predicts these, and a temperature that calibrates single vertices would sharpen them.
+    A mesh that is denser than the template thus gets points between the template's vertices. A
+    network that learnt barycentric coordinates as labels predicts these, and a temperature that
+    calibrates single vertices would sharpen them; it is left out.
 
     Args:
         found: Of V vertices.
@@ -112,7 +112,7 @@ def soft_points(
     for begin in range(0, len(known), PAIRS):
         chunk = known[begin : begin + PAIRS]
         weights = (
-            near[template[chunk]].multiply(found.rows(found.row_of[chunk], as_trained=True)).tocsr()
+            near[template[chunk]].multiply(found.rows(found.row_of[chunk], sharpened=False)).tocsr()
         )
         total = weights.sum(axis=1)[:, None]
         mean = (weights @ vertices) / np.maximum(total, TINY)
