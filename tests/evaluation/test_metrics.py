@@ -14,6 +14,14 @@ def correspondence_curve(errors: np.ndarray) -> list[float]:
     return [(errors <= threshold).mean() for threshold in THRESHOLDS]
 
 
+def test_the_curve_is_inclusive_and_starts_at_the_exact_match_rate():
+    errors = np.array([0, 0, 0.01, 0.05, 0.3])
+    metric = CorrespondenceError()
+    metric.update(errors, errors == 0)
+    curve = dict(zip(THRESHOLDS.tolist(), metric.compute()["curve"].tolist(), strict=True))
+    assert [curve[threshold] for threshold in (0.0, 0.01, 0.05, 0.2)] == [0.4, 0.6, 0.8, 0.8]
+
+
 def test_reported_radii_are_thresholds_of_the_curve():
     assert {0.0, 0.01, 0.05, 0.1, 0.2} <= set(THRESHOLDS.tolist())
 
