@@ -201,19 +201,17 @@ class Cache:
         Returns:
             What was removed.
         """
-        removed, size = [], 0
-        for entry in sorted(self.entries(), key=lambda entry: -entry.read):
-            if entry.path.suffix == TEMPORARY:
-                if entry.read > time.time() - A_DAY:
-                    continue  # another process may be writing it
-                old = True
-            else:
-                size += entry.size
-                old = since is not None and entry.read < since
+        entries = sorted(self.entries(), key=lambda entry: -entry.read)
+        day_ago = time.time() - A_DAY  # another process may be writing a younger temporary file
+        removed = [e for e in entries if e.path.suffix == TEMPORARY and e.read <= day_ago]
+        size = 0
+        for entry in (e for e in entries if e.path.suffix != TEMPORARY):
+            size += entry.size
+            old = since is not None and entry.read < since
             if old or (most is not None and size > most):
-                with contextlib.suppress(FileNotFoundError):
-                    entry.path.unlink()
                 removed.append(entry)
+        for entry in removed:
+            entry.path.unlink(missing_ok=True)
         return removed
 
 

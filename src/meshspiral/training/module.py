@@ -163,7 +163,9 @@ class Correspondence(L.LightningModule):
             meshes = sum(self.trainer.num_val_batches) * self.trainer.world_size
             step = math.ceil(meshes * len(labels) / SAMPLES)
             # copies: views would keep a file open for each mesh that a reader process sent
-            self._samples.append((x[::step].cpu(), labels[::step].clone().cpu()))
+            sampled_x = x[::step].to("cpu", copy=True)
+            sampled_labels = labels[::step].to("cpu", copy=True)
+            self._samples.append((sampled_x, sampled_labels))
         predicted = found.classes.cpu().numpy()
         self.log(f"{split}/loss", found.loss, batch_size=1, sync_dist=True)
         result = result_of(predicted, batch, self.distances)
