@@ -5,16 +5,18 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from meshspiral.data.damaged import Damaged, damaged, warped
+from meshspiral.data.damaged import Damaged, bumpy, damaged, warped
 from meshspiral.data.datasets.bodies import Bodies
 from meshspiral.data.settings import DamageSettings
 from meshspiral.data.shapes import Shape, SurfacePoints
 from meshspiral.experiment.compose import compose_train
 from meshspiral.experiment.schema import ConfigError
+from tests.meshes import icosphere
 
 NONE = {
     "noise": 0.0,
     "warp": 0.0,
+    "bumps": 0.0,
     "share": 1.0,
     "cut": 0.0,
     "holes": 0,
@@ -99,6 +101,29 @@ def test_a_warped_shape_keeps_its_faces_and_labels():
     np.testing.assert_array_equal(shape.labels, BODY.labels)
     moved = np.linalg.norm(shape.mesh.vertices - BODY.mesh.vertices, axis=1) / BODY.mesh.size
     assert moved.mean() > 1e-4 and moved.max() < 4 * 0.02 * 0.8
+    assert len(shape.mesh.faces) == len(BODY.mesh.faces)
+
+
+@pytest.mark.parametrize("slope", [0.1, 0.4])
+def test_bumps_have_the_slope_asked_for_and_move_along_the_normals(slope):
+    sphere = icosphere(5)
+    slopes = []
+    for seed in range(10):
+        moved = bumpy(sphere, slope, np.random.default_rng(seed))
+        heights = np.linalg.norm(moved, axis=1) - 1
+        np.testing.assert_allclose(moved, (1 + heights)[:, None] * sphere.vertices, atol=1e-3)
+        one, two = sphere.vertices[sphere.faces[:, 0]], sphere.vertices[sphere.faces[:, 1]]
+        rise = heights[sphere.faces[:, 0]] - heights[sphere.faces[:, 1]]
+        along_edge = rise / np.linalg.norm(one - two, axis=1)
+        slopes.append(np.sqrt(2 * np.mean(along_edge**2)))  # of two directions
+    assert np.mean(slopes) == pytest.approx(slope, rel=0.1)
+
+
+def test_a_bumpy_shape_keeps_its_faces_and_labels():
+    shape = apply(1, bumps=0.5)
+    np.testing.assert_array_equal(shape.labels, BODY.labels)
+    moved = np.linalg.norm(shape.mesh.vertices - BODY.mesh.vertices, axis=1) / BODY.mesh.size
+    assert 1e-4 < moved.mean() < 0.01
     assert len(shape.mesh.faces) == len(BODY.mesh.faces)
 
 

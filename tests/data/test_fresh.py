@@ -14,7 +14,15 @@ from meshspiral.data.sources import open_data, open_shapes
 from tests.data.test_datamodule import Toy
 from tests.helpers import composed, run, same_weights
 
-NOISE = {"noise": 0.01, "warp": 0.0, "share": 0.0, "cut": 0.0, "holes": 0, "hole_radius": 0.1}
+NOISE = {
+    "noise": 0.01,
+    "warp": 0.0,
+    "bumps": 0.0,
+    "share": 0.0,
+    "cut": 0.0,
+    "holes": 0,
+    "hole_radius": 0.1,
+}
 DAMAGE = DamageSettings(**NOISE, missing=0.0, size=0.0, seed=0)
 FRESH = ["data/damage=scans", "data.damage.share=0", "data.fresh=true"]
 

@@ -1,4 +1,4 @@
-"""Training shapes damaged as scans are: noise, warps, holes, missing faces and parts."""
+"""Training shapes damaged as scans are: noise, warps, bumps, holes, missing faces and parts."""
 
 from __future__ import annotations
 
@@ -16,6 +16,8 @@ from meshspiral.geometry.mesh import Mesh, used_vertices
 SMALLEST_HOLE = 0.02  # radius over the size of the shape
 WAVES = 4  # of a warp
 WAVELENGTHS = (0.1, 0.8)  # over the size of the shape
+RIPPLES = 24  # waves of bumps
+RIPPLE_LENGTHS = (0.03, 0.15)  # over the size of the shape
 KEPT = (0.35, 0.9)  # share of the vertices on the kept side of a cut
 LEAST = 0.25  # share of the vertices that must be left
 
@@ -63,6 +65,8 @@ def damaged(shape: Shape, settings: DamageSettings, rng: np.random.Generator) ->
     vertices = mesh.vertices
     if settings.warp:
         vertices = warped(vertices, rng.uniform(0, settings.warp), mesh.size, rng)
+    if settings.bumps:
+        vertices = bumpy(Mesh(vertices, mesh.faces), rng.uniform(0, settings.bumps), rng)
     noise = rng.uniform(0, settings.noise) * mesh.size
     vertices = vertices + rng.normal(scale=noise, size=vertices.shape)
     complete_area = (mesh.size * np.exp(rng.uniform(-settings.size, settings.size))) ** 2
@@ -101,11 +105,44 @@ def warped(
     Returns:
         The moved points, float [P, 3].
     """
-    lengths = size * np.exp(rng.uniform(*np.log(WAVELENGTHS), size=WAVES))
-    towards, along = (unit_vectors(WAVES, rng) for _ in range(2))
-    phases = rng.uniform(0, 2 * np.pi, size=WAVES)
-    waves = np.sin(2 * np.pi * points @ (towards / lengths[:, None]).T + phases)
-    return points + waves @ (amplitude * lengths[:, None] * along)
+    lengths = random_lengths(WAVES, WAVELENGTHS, size, rng)
+    along = unit_vectors(WAVES, rng)
+    return points + plane_waves(points, lengths, rng) @ (amplitude * lengths[:, None] * along)
+
+
+def bumpy(mesh: Mesh, slope: float, rng: np.random.Generator) -> np.ndarray:
+    """The vertices of a mesh, moved along their normals, as by hair, muscles and folds of clothes.
+
+    The height is a sum of plane waves. A wave of amplitude a and length l has a gradient of
+    (2 pi a / l) cos(...), of which a surface that is not aligned with it sees two thirds of the
+    square. So n waves with amplitudes c l have the slope 2 pi c sqrt(n / 3), as root mean square.
+
+    Args:
+        mesh: The surface.
+        slope: Root mean square of the tangents of the angles by which normals turn.
+        rng: Draws the waves.
+
+    Returns:
+        The moved vertices, float [V, 3].
+    """
+    lengths = random_lengths(RIPPLES, RIPPLE_LENGTHS, mesh.size, rng)
+    amplitudes = slope / (2 * np.pi * np.sqrt(RIPPLES / 3)) * lengths
+    heights = plane_waves(mesh.vertices, lengths, rng) @ amplitudes
+    return mesh.vertices + heights[:, None] * mesh.vertex_normals
+
+
+def random_lengths(
+    count: int, between: tuple[float, float], size: float, rng: np.random.Generator
+) -> np.ndarray:
+    """Wavelengths with uniform logarithms, float [count], in the unit of `size`."""
+    return size * np.exp(rng.uniform(*np.log(between), size=count))
+
+
+def plane_waves(points: np.ndarray, lengths: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """Sine waves of these lengths in random directions, float [P, waves]."""
+    towards = unit_vectors(len(lengths), rng)
+    phases = rng.uniform(0, 2 * np.pi, size=len(lengths))
+    return np.sin(2 * np.pi * points @ (towards / lengths[:, None]).T + phases)
 
 
 def unit_vectors(count: int, rng: np.random.Generator) -> np.ndarray:

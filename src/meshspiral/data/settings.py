@@ -75,6 +75,7 @@ class DamageSettings(Strict):
     warp: float = Field(
         ge=0, le=0.05, description="largest amplitude of a smooth warp, over its wavelength"
     )
+    bumps: float = Field(ge=0, le=1, description="largest slope of random bumps (root mean square)")
     share: float = Field(ge=0, le=1, description="share of the shapes that lose parts")
     cut: float = Field(ge=0, le=1, description="share of these that are cut by a plane")
     holes: int = Field(ge=0, description="largest number of holes in these")
