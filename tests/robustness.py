@@ -1,7 +1,7 @@
 """How robust labels are to changes of a mesh, measured outside the test suite:
 
     python -m tests.robustness 5
-    python -m tests.robustness 20 --rows mixed_1100 --run <run_folder>
+    python -m tests.robustness 20 --rows mixed_1100 bumps --run <run_folder>
     python -m tests.robustness 10 --split val --run <run_folder>
 
 Labels that many of the 20 test bodies, or of the 10 for validation, with the bundled network or
@@ -17,6 +17,7 @@ from __future__ import annotations
 import argparse
 import time
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -25,7 +26,7 @@ from tqdm import tqdm
 
 from meshspiral import Matcher, Mesh, scan
 from meshspiral.data.cache import Cache
-from meshspiral.data.damaged import warped
+from meshspiral.data.damaged import bumpy, warped
 from meshspiral.data.datasets.bodies import Bodies
 from meshspiral.data.reference import ReferenceDistances
 from meshspiral.data.remeshed import Remeshed
@@ -81,6 +82,10 @@ def warp(body: Shape, rng: np.random.Generator) -> Shape:
     return with_mesh(body, warped(mesh.vertices, 0.02, mesh.size, rng), mesh.faces)
 
 
+def add_bumps(body: Shape, rng: np.random.Generator, slope: float) -> Shape:
+    return with_mesh(body, bumpy(body.mesh, slope, rng), body.mesh.faces)
+
+
 def remove_faces(body: Shape, rng: np.random.Generator) -> Shape:
     faces = body.mesh.faces
     return with_mesh(body, body.mesh.vertices, faces[rng.random(len(faces)) >= 0.1])
@@ -111,6 +116,8 @@ CHANGES: dict[str, Callable[[Shape, np.random.Generator], Shape]] = {
     "a tenth of the faces removed": remove_faces,
     "cut off at the waist": cut_at_the_waist,
     "an arm, the head, part of a leg": three_parts,
+    "bumps, slope 0.4": partial(add_bumps, slope=0.4),
+    "bumps, slope 0.7": partial(add_bumps, slope=0.7),
 }
 
 
@@ -119,15 +126,23 @@ def main() -> None:
     parser.add_argument("bodies", type=int)
     parser.add_argument("--run", type=Path)
     parser.add_argument("--split", choices=["val", "test"], default="test")
-    parser.add_argument("--rows", nargs="*", default=[], help="such as mixed_1100; all if none")
+    parser.add_argument(
+        "--rows",
+        nargs="*",
+        default=[],
+        help="such as mixed_1100 or a word of a title; default: all",
+    )
     words = parser.parse_args()
     bodies = Bodies(1500)
     names = evenly(bodies.names[words.split], words.bodies)
     reference = ReferenceDistances(bodies.template, CACHE)
     originals = [bodies.load(name) for name in names]
     rng = np.random.default_rng(0)
-    changes = {} if words.rows else CHANGES
-    cases = {title: [change(body, rng) for body in originals] for title, change in changes.items()}
+    cases = {}
+    for title, change in CHANGES.items():
+        changed = [change(body, rng) for body in originals]  # always, to draw the same
+        if not words.rows or any(row in title for row in words.rows):
+            cases[title] = changed
     for policy, vertices in TESSELLATIONS:
         if words.rows and f"{policy}_{vertices}" not in words.rows:
             continue
