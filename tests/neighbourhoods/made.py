@@ -6,7 +6,7 @@ from meshspiral.neighbourhoods.patch import Patch
 from meshspiral.neighbourhoods.sampled import Sampled
 from meshspiral.neighbourhoods.spiral import Spiral
 
-STARTS = {"start": "random", "support": 0.8, "by_area": False, "jitter": 0}
+STARTS = {"start": "random", "support": 0.8, "by_area": False, "jitter": 0, "pooled": 1}
 
 
 def spiral(seq_len: int, rings: int | None = None, dilation=1, **starts) -> Spiral:

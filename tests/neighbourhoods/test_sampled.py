@@ -85,6 +85,18 @@ def test_a_radius_for_each_layer_gives_three_spirals():
         assert torch.equal(each, drawn_from(one, tensors_of(mesh, one))["spirals"])
 
 
+def test_the_maximum_over_all_starts_does_not_depend_on_the_draw():
+    torch.manual_seed(0)
+    mesh = bumpy_sphere()
+    features = torch.rand(len(mesh.vertices), 6)
+    net = FCSNet(6, 9, 11, channels=(12, 13, 14)).eval()
+    for pooled, same in ((5, True), (1, False)):
+        neighbourhood = sampled(start="random", pooled=pooled)
+        tensors = tensors_of(mesh, neighbourhood) | {"features": features}
+        one, other = (net.embed_batch(drawn_from(neighbourhood, tensors, s)) for s in (0, 1))
+        assert torch.allclose(one, other, atol=1e-6) == same
+
+
 @pytest.mark.parametrize("start", ["frame", "random"])
 def test_blended_features_are_those_interpolated_at_the_places(start):
     mesh, neighbourhood = punctured(bumpy_sphere(), 0.1), sampled(blend=True, start=start)
@@ -119,7 +131,14 @@ def test_the_diameter_is_another_unit():
 @pytest.mark.parametrize("metric", [False, True])
 @pytest.mark.parametrize(
     "settings",
-    [{}, {"blend": True}, {"radius": [0.2, 0.3, 0.4]}, {"blend": True, "radius": [0.2, 0.3, 0.4]}],
+    [
+        {},
+        {"blend": True},
+        {"radius": [0.2, 0.3, 0.4]},
+        {"blend": True, "radius": [0.2, 0.3, 0.4]},
+        {"pooled": 3},
+        {"blend": True, "radius": [0.2, 0.3, 0.4], "pooled": 2},
+    ],
 )
 def test_networks_read_it_as_they_read_sequences_layer_by_layer(network, metric, settings):
     """Against gathered features that are written out here."""
@@ -137,12 +156,15 @@ def test_networks_read_it_as_they_read_sequences_layer_by_layer(network, metric,
         points = batch["vertices"]
         if places is not None:
             x, points = (resample(each, Resampling(**places)) for each in (x, points))
+        spirals = spirals.reshape(-1, 11)
         sequences = x[spirals]
         rows = torch.arange(sequences.shape[0] * 11).view(-1, 11)
         information = None
         if metric:
             information = metric_features(points[spirals].flatten(0, 1), rows, batch["unit"])
-        x = torch.relu(layer(sequences.flatten(0, 1), rows, information))
+        outputs = layer(sequences.flatten(0, 1), rows, information)
+        outputs = outputs.view(len(mesh.vertices), settings.get("pooled", 1), -1)
+        x = torch.relu(outputs.amax(1))
     expected = torch.relu(net.neck(x))
     torch.testing.assert_close(net.embed_batch(batch), expected, rtol=1e-4, atol=1e-5)
     net.embed_batch(batch).sum().backward()

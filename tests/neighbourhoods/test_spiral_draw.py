@@ -126,6 +126,29 @@ def test_dilation_is_one_number_or_three(dilation):
         spiral(6, dilation=dilation)
 
 
+@pytest.mark.parametrize("start", ["frame", "random"])
+def test_pooled_starts_are_the_one_drawn_and_others_evenly_around(start):
+    mesh = punctured(bumpy_sphere(), 0.2)
+    one, three = spiral(6, start=start), spiral(6, start=start, pooled=3)
+    table = spiral_table(mesh, 6)
+    single = drawn_from(one, tensors_of(mesh, one), seed=5)
+    several = drawn_from(three, tensors_of(mesh, three), seed=5)
+    assert several.shape == (len(mesh.vertices), 3, 6)
+    assert torch.equal(several[:, 0], single)
+    for v, rows in enumerate(several.tolist()):
+        own = table.sequences[table.first[v] : table.first[v + 1]].tolist()
+        first = own.index(rows[0])
+        assert rows == [own[(first + k * len(own) // 3) % len(own)] for k in range(3)]
+
+
+def test_pooled_spirals_may_have_a_dilation_for_each_layer():
+    mesh = bumpy_sphere()
+    layers = spiral(6, dilation=[1, 2, 3], pooled=2)
+    drawn = drawn_from(layers, tensors_of(mesh, layers), seed=4)
+    assert [each.shape for each in drawn] == 3 * [(len(mesh.vertices), 2, 6)]
+    assert torch.equal(drawn[0][:, :, 2], drawn[1][:, :, 1])
+
+
 def test_jitter_needs_the_frame():
     with pytest.raises(ValueError, match="jitter needs start=frame"):
         spiral(6, jitter=1)

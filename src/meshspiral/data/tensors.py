@@ -100,7 +100,7 @@ def sequence_points(mesh: Mesh, neighbourhood: Neighbourhood, vertex: int) -> np
     spirals, places = batch["spirals"], batch.get("places")
     if isinstance(spirals, tuple):
         spirals, places = spirals[0], places and places[0]
-    row = spirals[vertex].numpy()
+    row = spirals[vertex].reshape(-1, spirals.shape[-1])[0].numpy()  # of the first start
     row = row[row >= 0]
     if places is None:
         return mesh.vertices[row]

@@ -387,7 +387,14 @@ def read_stored_config(values: dict[str, Any], source: str = "the config") -> Tr
 
 
 # settings of a spiral that were added after version 0.2, with the values of its time
-STARTED = {"dilation": 1, "start": "random", "support": 0.3, "by_area": True, "jitter": 0}
+STARTED = {
+    "dilation": 1,
+    "start": "random",
+    "support": 0.3,
+    "by_area": True,
+    "jitter": 0,
+    "pooled": 1,
+}
 
 
 def upgraded(values: dict[str, Any]) -> dict[str, Any]:
@@ -435,6 +442,8 @@ def upgraded(values: dict[str, Any]) -> dict[str, Any]:
     if values["neighbourhood"].get("name") == "spiral":
         for key, value in STARTED.items():
             values["neighbourhood"].setdefault(key, value)
+    if values["neighbourhood"].get("name") == "sampled":
+        values["neighbourhood"].setdefault("pooled", 1)
     data.setdefault("shuffle_vertices", False)
     data.setdefault("half", False)
     data.setdefault("fresh", False)

@@ -28,7 +28,8 @@ class Sampled(StartedSequences, name="sampled"):
     features interpolated from the three vertices of its face.
 
     Gives `spirals`, int64 [V, L] with L = 1 + rings * rays: vertices; or with `blend` rows of
-    `places`, the fields of a `Resampling`. With a radius for each layer, both are tuples of three.
+    `places`, the fields of a `Resampling`. With several starts it is [V, S, L]. With a radius for
+    each layer, both are tuples of three.
     """
 
     gives, noun = "spirals", "sampled spirals"
@@ -136,9 +137,10 @@ class Sampled(StartedSequences, name="sampled"):
         starts = batch.pop("starts")
         counts = torch.full_like(starts, self.settings.rays)
         jitter = self.settings.jitter if training else 0
-        starts = draw_starts(counts, None if self.random else starts, jitter, generator)
+        frames, pooled = None if self.random else starts, self.settings.pooled
+        starts = draw_starts(counts, frames, jitter, generator, pooled)
         columns = turned_columns(self.settings.rings, self.settings.rays, starts.device)
-        columns = columns.index_select(0, starts)
+        columns = columns.index_select(0, starts.flatten()).view(len(starts), -1)  # [V, S * L]
         if self.settings.blend:
             own = torch.arange(len(starts), device=starts.device) * self.length
             drawn = [own[:, None] + columns] * len(batch["places"])
@@ -146,6 +148,8 @@ class Sampled(StartedSequences, name="sampled"):
                 batch["places"] = batch["places"][0]
         else:
             drawn = [table.gather(1, columns).long() for table in batch.pop("sequences")]
+        if pooled > 1:
+            drawn = [each.unflatten(1, (pooled, self.length)) for each in drawn]
         batch["spirals"] = drawn[0] if len(drawn) == 1 else tuple(drawn)
         return batch
 

@@ -23,8 +23,8 @@ from meshspiral.neighbourhoods.starts import (
 class Spiral(StartedSequences, name="spiral"):
     """The spiral around each vertex: N vertices, or all vertices of k rings.
 
-    Gives `spirals`, int64 [V, N]: one spiral of every vertex; -1 where it has ended. With a
-    dilation for each layer it is a tuple of three.
+    Gives `spirals`, int64 [V, N]: one spiral of every vertex; -1 where it has ended. With several
+    starts it is [V, S, N]. With a dilation for each layer it is a tuple of three.
     """
 
     gives, noun = "spirals", "spirals"
@@ -100,9 +100,12 @@ class Spiral(StartedSequences, name="spiral"):
         batch = dict(batch)
         sequences, first = batch.pop("sequences"), batch.pop("first")
         jitter = self.settings.jitter if training else 0
-        starts = draw_starts(first.diff(), batch.pop("starts", None), jitter, generator)
-        drawn = sequences.index_select(0, first[:-1] + starts).long()
+        pooled = self.settings.pooled
+        starts = draw_starts(first.diff(), batch.pop("starts", None), jitter, generator, pooled)
+        rows = (first[:-1, None] + starts).flatten()
+        drawn = sequences.index_select(0, rows).long().unflatten(0, starts.shape)
+        drawn = drawn.squeeze(1) if pooled == 1 else drawn
         if len(self._steps) > 1:
-            drawn = tuple(drawn[:, ::step][:, : self.length] for step in self._steps)
+            drawn = tuple(drawn[..., ::step][..., : self.length] for step in self._steps)
         batch["spirals"] = drawn
         return batch

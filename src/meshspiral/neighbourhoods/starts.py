@@ -28,6 +28,11 @@ class StartSettings(Neighbourhood.Settings):
     jitter: int = Field(
         ge=0, description="start=frame: up to so many steps beside it in training, at random"
     )
+    pooled: int = Field(
+        ge=1,
+        description="number of starts, evenly around a vertex, of which each layer takes the "
+        "maximum; a step takes so many times as long",
+    )
 
     @property
     def frame(self) -> Frame:
@@ -57,10 +62,11 @@ class StartedSequences(Neighbourhood):
 
 def start_title(settings: StartSettings) -> str:
     """The start for titles: empty for the paper's random one."""
+    pooled = f", maximum over {settings.pooled} starts" if settings.pooled > 1 else ""
     if settings.start == "random":
-        return ""
+        return pooled
     jitter = f", jitter {settings.jitter}" if settings.jitter else ""
-    return f", from the frame of support {settings.support}{jitter}"
+    return f", from the frame of support {settings.support}{jitter}{pooled}"
 
 
 def draw_starts(
@@ -68,8 +74,9 @@ def draw_starts(
     frames: torch.Tensor | None,
     jitter: int,
     generator: torch.Generator | None = None,
+    pooled: int = 1,
 ) -> torch.Tensor:
-    """Draw the start of every vertex's spiral.
+    """Draw the starts of every vertex's spirals.
 
     Args:
         counts: int64 [V], the number of starts of each vertex, at least 1.
@@ -77,15 +84,18 @@ def draw_starts(
             the start is drawn from all. None: drawn from all everywhere.
         jitter: Draw from the starts at most so many steps from `frames`.
         generator: On the same device; None for torch's default.
+        pooled: Number of starts S of each vertex: the one drawn, and others evenly around it.
 
     Returns:
-        int64 [V], each in 0..counts - 1.
+        int64 [V, S], each in 0..counts - 1.
     """
     draw = torch.rand(len(counts), device=counts.device, generator=generator)
     # draw < 1, but a float32 just below 1 times the count may round up to the count
     start = (draw * counts).long().clamp(max=counts - 1)
-    if frames is None:
-        return start
-    width = 2 * jitter + 1
-    beside = (draw * width).long().clamp(max=width - 1) - jitter
-    return torch.where(frames < 0, start, (frames + beside) % counts)
+    if frames is not None:
+        width = 2 * jitter + 1
+        beside = (draw * width).long().clamp(max=width - 1) - jitter
+        start = torch.where(frames < 0, start, (frames + beside) % counts)
+    counts = counts[:, None]
+    steps = torch.arange(pooled, device=counts.device) * counts // pooled
+    return (start[:, None] + steps) % counts

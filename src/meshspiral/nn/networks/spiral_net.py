@@ -83,7 +83,8 @@ class SpiralNet(ThreeLayerNet):
             for i in range(len(spirals) if isinstance(spirals, tuple) else 1):
                 sequences, sampled = _of_layer(i, spirals, places)
                 points = vertices if sampled is None else resample(vertices, sampled)
-                metric.append(metric_features(points, sequences, unit))
+                values = metric_features(points, sequences.flatten(0, -2), unit)
+                metric.append(values.unflatten(0, sequences.shape[:-1]))
             metric = tuple(metric) if isinstance(spirals, tuple) else metric[0]
         return self.embed(batch["features"], spirals, metric, places)
 
@@ -99,7 +100,8 @@ class SpiralNet(ThreeLayerNet):
         Args:
             features: float [V, in_features].
             spirals: int64 [V, N], -1 where a spiral has ended; vertices, or rows of `places`.
-            metric: float [V, N, 2], see `metric_features`.
+                int64 [V, S, N] for the maximum over S spirals of each vertex.
+            metric: float [V, N, 2] or [V, S, N, 2], see `metric_features`.
             places: Points whose features are blended from those of vertices; None for vertices.
 
         Returns:
@@ -117,7 +119,11 @@ class SpiralNet(ThreeLayerNet):
         spirals, metric, places = _of_layer(i, *neighbourhood)
         if places is not None:
             x = resample(x, places)
-        return self.layers[i](x, spirals, metric)
+        if spirals.ndim == 2:
+            return self.layers[i](x, spirals, metric)
+        starts = spirals.shape[:2]
+        metric = None if metric is None else metric.flatten(0, 1)
+        return self.layers[i](x, spirals.flatten(0, 1), metric).unflatten(0, starts).amax(1)
 
 
 class OneLengthNet(SpiralNet):
