@@ -130,8 +130,9 @@ def main() -> None:
         "--rows",
         nargs="*",
         default=[],
-        help="such as mixed_1100 or a word of a title; default: all",
+        help="such as mixed_1100, or part of a title; default: all",
     )
+    parser.add_argument("--options", nargs="*", choices=OPTIONS, default=list(OPTIONS))
     words = parser.parse_args()
     bodies = Bodies(1500)
     names = evenly(bodies.names[words.split], words.bodies)
@@ -149,9 +150,9 @@ def main() -> None:
         remeshed = Remeshed(bodies, CACHE, None, policy, vertices)
         remeshed.prepare(names)
         cases[f"{policy}, {vertices:,} vertices"] = [remeshed.load(name) for name in names]
-    matchers = [Matcher.load(words.run, **options) for options in OPTIONS.values()]
+    matchers = [Matcher.load(words.run, **OPTIONS[name]) for name in words.options]
     mirror = mirror_images(bodies.template, bodies.up)
-    print(f"{'':44}" + "".join(f"{name:>52}" for name in OPTIONS))
+    print(f"{'':44}" + "".join(f"{name:>52}" for name in words.options))
     for title, shapes in cases.items():
         print_row(title, [measure(matcher, shapes, reference, mirror) for matcher in matchers])
 
