@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from meshspiral.geometry.barycentric import interpolate
+from meshspiral.geometry.connectivity import one_rings
 from meshspiral.geometry.mesh import Mesh
 from meshspiral.geometry.sampling import (
     nearest_corners,
@@ -146,6 +147,26 @@ def test_degenerate_faces_give_whole_sequences():
     start = np.nan_to_num(surface_directions(flat, local_frames(vertices, 1.0)[:, 0]))
     table = sampled_places(flat, 0.5, 2, 6, start)
     assert table.exists.all() and np.isfinite(table.weights).all()
+
+
+@pytest.mark.parametrize("degrees", [10, 100, 190, 280])
+def test_a_neighbour_at_the_same_point_does_not_give_the_direction(degrees):
+    mesh = lattice(9, 9)
+    centre = 4 * 9 + 4
+    vertices = mesh.vertices.copy()
+    vertices[centre + 1] = vertices[centre]
+    axis = np.array([np.cos(np.radians(degrees)), np.sin(np.radians(degrees)), 0])
+    axes = np.tile(axis, (len(vertices), 1))
+    flat = Mesh(vertices, mesh.faces)
+    nearest = nearest_neighbours(flat, axes)[centre]
+    neighbours, first = one_rings(flat)
+    ring = neighbours[first[centre] : first[centre + 1]]
+    cosines = (vertices[ring] - vertices[centre]) @ axis
+    cosines /= np.linalg.norm(vertices[ring] - vertices[centre], axis=1) + 1e-300
+    assert ring[nearest] != centre + 1 and nearest == cosines.argmax()
+    if degrees in (100, 190):  # within the faces that are left
+        step = positions(flat, 0.5, 1, 1, surface_directions(flat, axes))[centre, 1]
+        np.testing.assert_allclose(step - vertices[centre], 0.5 * axis, atol=1e-5)
 
 
 def test_renumbering_renumbers_the_places():

@@ -130,13 +130,16 @@ def _tangent(normal, axis, tangent, bitangent):
 
 @njit(cache=True, error_model="numpy")
 def _edge_angle(vertices, v, w, tangent, bitangent):
-    """The angle of the edge from v to w in the tangent plane, counter-clockwise, in -pi..pi."""
+    """The angle of the edge from v to w in the tangent plane, counter-clockwise, in -pi..pi.
+
+    NaN, which compares as neither below nor above, if v and w coincide there.
+    """
     x, y = 0.0, 0.0
     for i in range(3):
         step = vertices[w, i] - vertices[v, i]
         x += step * tangent[i]
         y += step * bitangent[i]
-    return np.arctan2(y, x)
+    return np.arctan2(y, x) if x != 0 or y != 0 else np.nan
 
 
 @njit(cache=True, error_model="numpy")
