@@ -114,6 +114,7 @@ def test_the_stages_of_a_match_are_reported(trained, files):
 
 def test_the_bar_shows_the_stages(cli, trained, files, monkeypatch):
     monkeypatch.setattr("os.get_terminal_size", lambda *_: os.terminal_size((80, 24)))
+    monkeypatch.setattr("meshspiral.data.progress.in_place", lambda stream: True)
     words = ["a.ply", "b.ply", f"run={trained}", "picture=false", "smooth=true"]
     _, _, err = cli(*words, program=main)
     shown = [line.rstrip() for line in re.split("[\r\n]", err) if "|" in line]

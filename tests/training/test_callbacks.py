@@ -43,6 +43,7 @@ def test_the_bar_and_its_metrics_fit(capfd, monkeypatch, columns, bar):
     """A run of hours, late: the longest texts."""
     size = os.terminal_size((columns, 24))
     monkeypatch.setattr("os.get_terminal_size", lambda *_: size)
+    monkeypatch.setattr("meshspiral.data.progress.in_place", lambda stream: True)
     trainer = SimpleNamespace(
         max_epochs=100,
         current_epoch=98,

@@ -5,12 +5,11 @@ from __future__ import annotations
 import logging
 import time
 
-from tqdm import tqdm
-
 from meshspiral.benchmarking.inputs import network_of, torus_batch
 from meshspiral.benchmarking.measure import Row, in_own_process, peak_bytes
 from meshspiral.benchmarking.reference import reference_loss, reference_network
 from meshspiral.benchmarking.steps import training_loss
+from meshspiral.data.progress import Progress
 from meshspiral.data.tensors import draw
 from meshspiral.experiment.schema import BenchmarkConfig, TrainConfig, load_plugins
 from meshspiral.neighbourhoods import Neighbourhood
@@ -43,7 +42,7 @@ def memory_rows(config: BenchmarkConfig, networks: list[TrainConfig]) -> list[Ro
     at `LARGE` has None there, by extrapolation in proportion to the vertices.
     """
     rows: list[Row] = []
-    for network in tqdm(networks, desc="Memory"):
+    for network in Progress(networks, desc="Memory"):
         size = config.vertices
         ours = in_own_process(pass_cost, network, size, size, False, config.threads)
         reference = in_own_process(pass_cost, network, size, size, True, config.threads)

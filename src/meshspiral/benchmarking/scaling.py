@@ -6,11 +6,11 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from tqdm import tqdm
 
 from meshspiral.benchmarking.inputs import network_of, torus_batch
 from meshspiral.benchmarking.measure import Action, Row, in_own_process, medians, peak_bytes
 from meshspiral.benchmarking.memory import too_large
+from meshspiral.data.progress import Progress
 from meshspiral.data.tensors import draw
 from meshspiral.experiment.schema import BenchmarkConfig, TrainConfig, load_plugins
 from meshspiral.neighbourhoods import Neighbourhood
@@ -65,7 +65,7 @@ def scaling_rows(config: BenchmarkConfig, networks: list[TrainConfig]) -> list[R
     for series in all_series(networks):
         costs: list[tuple[float, float | None]] = []
         stopped = ""
-        for size in tqdm(series.sizes, desc=f"{series.what} over {series.over}"):
+        for size in Progress(series.sizes, desc=f"{series.what} over {series.over}"):
             if costs and costs[-1][1] is not None:
                 expected = costs[-1][1] * size / series.sizes[len(costs) - 1]
                 if too_large(1e6 * expected):

@@ -7,12 +7,12 @@ from functools import partial
 
 import torch
 from torch import Tensor, nn
-from tqdm import tqdm
 
 from meshspiral.benchmarking.inputs import body_batch, network_of
 from meshspiral.benchmarking.measure import Action, Row, medians
 from meshspiral.benchmarking.products import ProductRecorder, replay
 from meshspiral.benchmarking.reference import reference_loss, reference_network
+from meshspiral.data.progress import Progress
 from meshspiral.data.tensors import draw
 from meshspiral.experiment.schema import BenchmarkConfig, TrainConfig
 from meshspiral.neighbourhoods import Neighbourhood
@@ -59,7 +59,7 @@ def step_rows(config: BenchmarkConfig, networks: list[TrainConfig]) -> list[Row]
     device = device_of(config.accelerator)
     precision = choose_precision(config.precision, config.accelerator)
     rows = []
-    for network in tqdm(networks, desc="Steps"):
+    for network in Progress(networks, desc="Steps"):
         neighbourhood = Neighbourhood.of(network.neighbourhood)
         drawing = partial(draw, neighbourhood, body_batch(network, device), network.seed)
         batch = drawing()

@@ -9,10 +9,9 @@ import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
-from tqdm import tqdm
-
 from meshspiral.data.files import legal_name, write_file
 from meshspiral.data.mesh_files import SUFFIXES
+from meshspiral.data.progress import Progress
 from meshspiral.data.shapes import DataError
 from meshspiral.experiment.entry import entry_point
 from meshspiral.experiment.quoting import quote
@@ -104,7 +103,7 @@ def stage_bar(*roles: str) -> Iterator[Callable[[str, str], None]]:
     stages += [(role, stage) for role in roles for stage in labelling]
     stages += [("source", "writing")] * ("source" in roles)
     bar_format = "{desc:<24} {n_fmt:>2}/{total_fmt}|{bar}| {elapsed}"
-    with tqdm(total=len(stages), bar_format=bar_format, leave=False, dynamic_ncols=True) as bar:
+    with Progress(total=len(stages), bar_format=bar_format, leave=False, dynamic_ncols=True) as bar:
 
         def report(role: str, stage: str) -> None:
             bar.n = stages.index((role, stage))

@@ -14,8 +14,8 @@ from typing import Any
 from joblib import Parallel, cpu_count, delayed, effective_n_jobs, parallel_config
 from joblib.externals.loky.process_executor import TerminatedWorkerError
 from joblib.parallel import get_active_backend
-from tqdm import tqdm
 
+from meshspiral.data.progress import Progress
 from meshspiral.data.shapes import DataError
 
 POOL_START = 6.0  # seconds that starting the worker processes takes
@@ -46,7 +46,7 @@ def run_all(
     cluster = _is_on_cluster()
     workers = effective_n_jobs(-1) if cluster else min(workers or cpu_count(), len(items))
     results: list[Any] = [None] * len(items)
-    with tqdm(total=len(items), desc=description, unit="mesh", delay=1.0) as progress:
+    with Progress(total=len(items), desc=description, unit="mesh", delay=1.0) as progress:
         started = None
         for done, i in enumerate(order):
             is_long = cluster

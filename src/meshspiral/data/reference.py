@@ -8,9 +8,9 @@ from functools import partial
 from importlib.metadata import version
 
 import numpy as np
-from tqdm import tqdm
 
 from meshspiral.data.cache import Cache, code_version
+from meshspiral.data.progress import Progress
 from meshspiral.geometry import geodesics, mesh
 from meshspiral.geometry.digest import digest
 from meshspiral.geometry.mesh import Mesh
@@ -63,7 +63,7 @@ class ReferenceDistances:
         distances = np.zeros(len(sources))
         apart = np.flatnonzero(sources != targets)
         blocks = sources[apart] // BLOCK
-        progress = tqdm(
+        progress = Progress(
             np.unique(blocks), desc="Geodesic distances", unit="block", leave=False, delay=1.0
         )
         for block in progress:
@@ -106,7 +106,7 @@ class ReferenceDistances:
     def _all_blocks(self, title: str) -> Iterator[tuple[int, np.ndarray]]:
         """All blocks with their numbers, with a progress bar."""
         numbers = range(-(-len(self.template.vertices) // BLOCK))
-        for block in tqdm(numbers, desc=title, unit="block", leave=False, delay=1.0):
+        for block in Progress(numbers, desc=title, unit="block", leave=False, delay=1.0):
             yield block, self._block(block)
 
     def _block(self, block: int) -> np.ndarray:

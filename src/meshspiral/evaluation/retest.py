@@ -9,10 +9,10 @@ from typing import Any
 
 import numpy as np
 from omegaconf import OmegaConf
-from tqdm import tqdm
 
 from meshspiral.data.datamodule import CorrespondenceData
 from meshspiral.data.files import write_file
+from meshspiral.data.progress import Progress
 from meshspiral.data.shapes import DataError, SurfacePoints
 from meshspiral.data.sources import open_data
 from meshspiral.evaluation.distributions import (
@@ -148,7 +148,7 @@ def choose_shapes(shapes: int | list[str], names: list[str]) -> list[str]:
 def evaluate(predict: Predict, data: CorrespondenceData) -> Outcome:
     """Predict all test shapes as `train` does."""
     names, items = data.shapes.names["test"], data.datasets["test"]
-    progress = tqdm(range(len(items)), desc="Test", unit="mesh", leave=False, delay=1.0)
+    progress = Progress(range(len(items)), desc="Test", unit="mesh", leave=False, delay=1.0)
     results = {i: predict_mesh(predict, data, i, "evaluation") for i in progress}
     return Outcome.of(names, items, results, data.reference.diameter)
 
@@ -156,7 +156,7 @@ def evaluate(predict: Predict, data: CorrespondenceData) -> Outcome:
 def evaluate_rotations(predict: Predict, data: CorrespondenceData, count: int) -> Rotations:
     """Predict all test shapes `count` times, each time with other random neighbourhoods."""
     items = data.datasets["test"]
-    progress = tqdm(range(count), desc="Rotations", unit="run")
+    progress = Progress(range(count), desc="Rotations", unit="run")
     runs = (
         [predict_mesh(predict, data, i, f"rotation {r}") for i in range(len(items))]
         for r in progress
@@ -182,7 +182,7 @@ def evaluate_points(
     """
     template, errors = data.shapes.template, []
     near = near_vertices(template, SPREAD)
-    progress = tqdm(predicted.names, desc="Points", unit="mesh", leave=False, delay=1.0)
+    progress = Progress(predicted.names, desc="Points", unit="mesh", leave=False, delay=1.0)
     for batch, name in zip(data.datasets["test"], progress, strict=True):
         labels = predicted.predicted[predicted.mesh(name)]
         points = soft_points(predict(batch, "evaluation"), labels, near, template.vertices)

@@ -7,10 +7,10 @@ from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
-from tqdm import tqdm
 
 from meshspiral.data.datamodule import CorrespondenceData
 from meshspiral.data.files import write_file
+from meshspiral.data.progress import Progress
 from meshspiral.evaluation.metrics import THRESHOLDS
 from meshspiral.evaluation.outcome import Outcome
 from meshspiral.viz.colors import error_colors, template_colors
@@ -71,7 +71,7 @@ def write_plots(
         return
     rows = [correspondence_row(outcome, data, chosen), error_row(outcome, data, chosen)]
     try:
-        with tqdm(total=1, desc="Rendering", leave=False, delay=1.0):
+        with Progress(total=1, desc="Rendering", leave=False, delay=1.0):
             correspondence, errors = render(rows, data.shapes.up)
     except RenderError as error:
         log.warning("skipping renders: %s", error)

@@ -10,11 +10,11 @@ from typing import NamedTuple
 
 import torch
 from joblib import cpu_count
-from tqdm import tqdm
 
 from meshspiral.data.files import legal_name
 from meshspiral.data.mesh_files import SUFFIXES
 from meshspiral.data.pool import run_in_pool
+from meshspiral.data.progress import Progress
 from meshspiral.data.shapes import DataError
 from meshspiral.geometry.mesh import MeshError
 from meshspiral.matching.job import MatchJob
@@ -73,11 +73,11 @@ def match_batch(
     results = run_in_pool(_match_source, tasks, workers, "workers=1")
     refused: dict[str, str] = {}
     repaired = 0
-    for result in tqdm(results, total=len(waiting), desc="Matching", unit="mesh"):
+    for result in Progress(results, total=len(waiting), desc="Matching", unit="mesh"):
         repaired += result.repaired
         if result.refusal:
             refused[result.path] = result.refusal
-            tqdm.write(f"refused: {result.refusal}")
+            Progress.write(f"refused: {result.refusal}")
     return BatchResult(len(waiting) - len(refused), repaired, refused)
 
 

@@ -8,9 +8,9 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
-from tqdm import tqdm
 
 from meshspiral.data.files import write_file
+from meshspiral.data.progress import Progress
 from meshspiral.evaluation.metrics import THRESHOLDS
 from meshspiral.geometry.digest import digest
 from meshspiral.reporting.groups import Group, other_keys
@@ -25,7 +25,7 @@ def write_plots(groups: list[Group], folder: Path) -> dict[str, str]:
     """
     plots = {}
     comparisons = dict(compared_curves(groups))
-    for title, curves in tqdm(comparisons.items(), desc="Curves", leave=False, delay=1.0):
+    for title, curves in Progress(comparisons.items(), desc="Curves", leave=False, delay=1.0):
         figure = curve_figure({name: (THRESHOLDS, several) for name, several in curves.items()})
         svg = encoded(figure, "svg").decode()
         plots[title] = svg[svg.index("<svg") :]

@@ -7,9 +7,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from tqdm import tqdm
 
 from meshspiral.data.datamodule import CorrespondenceData
+from meshspiral.data.progress import Progress
 from meshspiral.data.shapes import DataError
 from meshspiral.data.sources import open_data
 from meshspiral.evaluation.outcome import Outcome, evenly
@@ -88,7 +88,7 @@ def scenes_of(runs: list[Run], count: int) -> tuple[Scenes, list[str]]:
     """
     scenes, notes = Scenes(), []
     root = Path(os.path.commonpath([run.folder.parent for run in runs]))
-    for run in tqdm(runs if count else [], desc="Shapes", leave=False, delay=1.0):
+    for run in Progress(runs if count else [], desc="Shapes", leave=False, delay=1.0):
         try:
             data = open_data(run.config)
             for name in evenly(run.outcome.names, count):

@@ -10,8 +10,8 @@ from typing import Any
 
 import lightning as L
 from lightning.pytorch.callbacks import Callback, ProgressBar
-from tqdm import tqdm
 
+from meshspiral.data.progress import Progress
 from meshspiral.evaluation.metrics import THRESHOLDS
 from meshspiral.experiment.run_folder import LAST, Stopped
 from meshspiral.viz.colors import template_colors
@@ -30,7 +30,7 @@ class Bar(ProgressBar):
 
     def __init__(self) -> None:
         super().__init__()
-        self._bar: tqdm | None = None
+        self._bar: Progress | None = None
 
     def disable(self) -> None:
         self._enabled = False
@@ -40,15 +40,12 @@ class Bar(ProgressBar):
 
     def on_train_start(self, trainer: L.Trainer, module: L.LightningModule) -> None:
         total = trainer.max_epochs * trainer.num_training_batches
-        # in a log file every update is a line of its own
-        every = 0.1 if sys.stderr.isatty() else 10.0
-        self._bar = tqdm(
+        self._bar = Progress(
             total=total,
             initial=trainer.fit_loop.epoch_loop.total_batch_idx + 1,
             desc=self._epoch(trainer),
             bar_format=BAR_FORMAT,
             unit="step" if trainer.accumulate_grad_batches == 1 else "mesh",
-            mininterval=every,
             disable=not trainer.is_global_zero,
             dynamic_ncols=True,
         )
@@ -83,7 +80,7 @@ class Bar(ProgressBar):
         self._begin("Test", trainer.num_test_batches)
 
     def _begin(self, what: str, batches: list[int]) -> None:
-        self._evaluation = tqdm(
+        self._evaluation = Progress(
             total=sum(batches),
             desc=what,
             unit="mesh",

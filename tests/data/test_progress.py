@@ -1,0 +1,67 @@
+"""Progress: in place on a terminal, lines in a file, messages above the bars."""
+
+from __future__ import annotations
+
+import io
+import logging
+import sys
+import time
+
+import pytest
+
+from meshspiral.data import progress
+from meshspiral.data.progress import ConsoleHandler, Progress
+
+
+class Terminal(io.StringIO):
+    def isatty(self) -> bool:
+        return True
+
+
+@pytest.fixture
+def every(monkeypatch):
+    monkeypatch.setattr(progress, "EVERY", 0.05)
+
+
+def work(**options) -> None:
+    for _ in Progress(range(8), desc="Meshes", **options):
+        time.sleep(0.02)
+
+
+@pytest.mark.parametrize("leave", [True, False])
+def test_a_file_gets_lines_without_bars(monkeypatch, every, leave):
+    monkeypatch.setattr(sys, "stderr", io.StringIO())
+    work(delay=0.01, leave=leave, bar_format="{bar}")
+    text = sys.stderr.getvalue()
+    assert "\r" not in text and "\x1b" not in text and text.endswith("\n")
+    lines = text.splitlines()
+    assert 1 <= len(lines) <= 5
+    assert all(line.startswith("Meshes: ") and line.endswith(" left") for line in lines)
+    assert (lines[-1].startswith("Meshes: 8/8, ")) == leave
+
+
+def test_short_work_leaves_a_file_empty(monkeypatch):
+    monkeypatch.setattr(sys, "stderr", io.StringIO())
+    work()
+    assert sys.stderr.getvalue() == ""
+
+
+def test_a_terminal_gets_one_bar_in_place(monkeypatch):
+    monkeypatch.setattr(sys, "stderr", Terminal())
+    work(mininterval=0)
+    text = sys.stderr.getvalue()
+    assert text.count("\n") == 1 and text.count("\r") >= 8 and "8/8" in text
+
+
+def test_messages_go_above_the_bar(monkeypatch):
+    monkeypatch.setattr(sys, "stderr", Terminal())
+    monkeypatch.setattr(sys, "stdout", sys.stderr)  # both on one screen
+    log = logging.Logger("table")
+    log.addHandler(ConsoleHandler(sys.stdout))
+    with Progress(total=2, desc="Meshes", ncols=40) as bar:
+        bar.update()
+        log.info("a row")
+        bar.update()
+    before, _, after = sys.stderr.getvalue().partition("a row\n")
+    assert before.endswith("\r") and before.rsplit("\r", 2)[1].strip() == ""  # the bar is wiped
+    assert "Meshes" in after
