@@ -47,6 +47,7 @@ METRICS = {
     "test/within_0.05",
     "test/within_0.10",
     "parameters",
+    "epochs/to_90_percent",
     *SECONDS,
 }
 # a process that ends as VTK's does without OpenGL, by a segmentation fault

@@ -105,11 +105,21 @@ def test_a_cluster_loses_nothing_when_a_worker_is_killed(cluster, tmp_path):
 
 
 def test_a_cluster_fills_the_cache_with_the_same_results(cli, cluster, arguments, tmp_path):
+    """One of its two workers is killed after the first result."""
     assert cli(*arguments, program=preprocess.main)[0] == 0
     alone = contents(tmp_path / "cache")
     other = tmp_path / "shared"
+
+    def kill() -> None:
+        while not any(other.rglob("*.safetensors")):
+            time.sleep(0.01)
+        os.kill(cluster.workers[0].pid, signal.SIGKILL)
+
+    killer = threading.Thread(target=kill)
+    killer.start()
     address = f"scheduler={cluster.scheduler_address}"
     code, _, err = cli(*arguments, f"data.cache_dir={other}", address, program=preprocess.main)
+    killer.join()
     assert code == 0, err
     assert contents(other) == alone and len(alone) > 20
 

@@ -234,14 +234,16 @@ STEPS = 6  # per epoch of the toy data set
 
 
 @pytest.mark.parametrize(
-    "signum, step",
-    [(signal.SIGINT, step) for step in (1, 2, STEPS - 1, STEPS, STEPS + 3, 4 * STEPS)]
-    + [(signal.SIGTERM, 2), (signal.SIGTERM, STEPS)],
+    "signum, step, readers",
+    [(signal.SIGINT, step, 0) for step in (1, 2, STEPS - 1, STEPS, STEPS + 3, 4 * STEPS)]
+    + [(signal.SIGTERM, 2, 0), (signal.SIGTERM, STEPS, 0)]
+    + [(signal.SIGINT, 2, 1)],  # with meshes that were read ahead
 )
 def test_a_stopped_run_resumes_to_the_same_weights(
-    whole_run, toy_overrides, tmp_path, monkeypatch, signum, step
+    whole_run, toy_overrides, tmp_path, monkeypatch, signum, step, readers
 ):
     """Stopped after the first step, within an epoch, at its end, and after the last step."""
+    toy_overrides = [*toy_overrides, f"data.readers={readers}"]
     original = Speed.on_train_batch_end
 
     def stop(self, trainer, *args):
@@ -519,6 +521,9 @@ def test_resuming_a_folder_that_is_not_a_run_is_rejected(tmp_path):
         ["trainer.precision=64"],
         ["optim.schedule=constant"],
         ["trainer.val_every=2", "optim.epochs=3"],
+        ["neighbourhood.start=frame", "neighbourhood.dilation=2"],
+        ["neighbourhood=sampled", "neighbourhood.pooled=2", "data.features=[shot,raw]"],
+        ["model=conv", "neighbourhood=sampled", "neighbourhood.blend=true", "metric=true"],
     ],
     ids=" ".join,
 )
@@ -528,6 +533,13 @@ def test_every_variant_trains(toy_overrides, tmp_path, overrides):
 
 
 LEARN = ["optim.epochs=60", "optim.lr=0.01", "model.dropout=0.1", "trainer.val_every=20"]
+
+
+def test_a_length_that_does_not_apply_is_said(cli, toy_overrides):
+    words = [word for word in toy_overrides if not word.startswith(("seq_len", "optim"))]
+    words += ["optim.epochs=1", "neighbourhood=sampled"]
+    code, out, err = cli(*words, "+seq_len=9")
+    assert code == 0 and "+seq_len=9: ignored, does not apply to sampled" in out, err
 
 
 def test_a_network_learns_independently_of_the_numbering(toy_overrides, tmp_path):

@@ -55,6 +55,22 @@ def people(monkeypatch):
     )
 
 
+@pytest.mark.parametrize("folds, taken, drawn", [([5, 3, 4, 6, 3, 9, 9, 9], 1, 8), ([5, 0], 1, 2)])
+def test_the_pose_that_folds_the_surface_least_is_taken(people, monkeypatch, folds, taken, drawn):
+    bodies, counts = [], iter(folds)
+
+    class Model:
+        def posed(self, traits, pose):
+            bodies.append(np.random.default_rng(len(bodies)).normal(size=(20_000, 3)))
+            return bodies[-1]
+
+    monkeypatch.setattr(module, "body_model", Model)
+    monkeypatch.setattr(module, "folded_faces", lambda mesh: next(counts))
+    shape = people().load("train_0000_00")
+    assert len(bodies) == drawn
+    np.testing.assert_allclose(shape.mesh.vertices, Surface(1500).of(bodies[taken]), atol=1e-6)
+
+
 def test_other_people_are_validated_and_tested_on(people):
     few, many = people(), people(subjects=40)
     assert [len(few.names[split]) for split in ("train", "val", "test")] == [6, 30, 30]

@@ -12,8 +12,10 @@ import pytest
 import torch
 
 from meshspiral.data import dataset
+from meshspiral.data.damaged import Damaged
 from meshspiral.data.dataset import MeshDataset
 from meshspiral.data.datasets.folder import Folder
+from meshspiral.data.remeshed import Remeshed
 from meshspiral.data.sources import open_data
 from meshspiral.geometry.mesh import Mesh
 from tests.conftest import TOY_SPLIT, toy_shapes
@@ -55,10 +57,16 @@ def assert_same(a, b):
             assert torch.equal(one[key], other[key]), key
 
 
-def test_a_second_start_reads_no_mesh(config, monkeypatch):
-    first = opened(config())
+REMESHED = ("data/remesh=mixed", "data.remesh.vertices=120", "data.remesh.copies=2")
+
+
+@pytest.mark.parametrize("words", [(), (*REMESHED, "data/damage=scans")], ids=["plain", "remeshed"])
+def test_a_second_start_reads_no_mesh(config, monkeypatch, words):
+    first = opened(config(*words))
     monkeypatch.setattr(Folder, "load", None)
-    assert_same(opened(config()), first)
+    monkeypatch.setattr(Remeshed, "load", None)
+    monkeypatch.setattr(Damaged, "load", None)
+    assert_same(opened(config(*words)), first)
 
 
 @pytest.mark.parametrize(

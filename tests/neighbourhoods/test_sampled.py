@@ -16,7 +16,7 @@ from meshspiral.geometry.shot import local_frames
 from meshspiral.neighbourhoods.sampled import turned_columns
 from meshspiral.nn.geodesic import Resampling, resample
 from meshspiral.nn.layers import metric_features
-from meshspiral.nn.networks import FCSNet, LSTMNet
+from meshspiral.nn.networks import ConvNet, FCSNet, LSTMNet
 from tests.meshes import bumpy_sphere, lattice, punctured, union
 from tests.neighbourhoods.made import sampled
 
@@ -127,7 +127,7 @@ def test_the_diameter_is_another_unit():
     assert torch.equal(tensors[0]["sequences"], tensors[1]["sequences"])
 
 
-@pytest.mark.parametrize("network", [FCSNet, LSTMNet])
+@pytest.mark.parametrize("network", [FCSNet, LSTMNet, ConvNet])
 @pytest.mark.parametrize("metric", [False, True])
 @pytest.mark.parametrize(
     "settings",
@@ -146,7 +146,7 @@ def test_networks_read_it_as_they_read_sequences_layer_by_layer(network, metric,
     mesh, neighbourhood = bumpy_sphere(), sampled(**settings)
     batch = drawn_from(neighbourhood, tensors_of(mesh, neighbourhood))
     batch["features"] = torch.rand(len(mesh.vertices), 6)
-    length = {"seq_len": 11} if network is FCSNet else {}
+    length = {} if network is LSTMNet else {"seq_len": 11}
     net = network(6, 9, channels=(12, 13, 14), metric=metric, **length).eval()
     x = torch.relu(net.lift(batch["features"]))
     for i, layer in enumerate(net.layers):

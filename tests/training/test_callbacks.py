@@ -9,7 +9,7 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from meshspiral.training.callbacks import Bar, Speed
+from meshspiral.training.callbacks import Bar, Convergence, Speed
 from tests.helpers import run
 
 
@@ -36,6 +36,16 @@ def test_the_speed_counts_steps_not_meshes(monkeypatch):
     module = SimpleNamespace(log=lambda key, value, **_: logged.update({key: value}))
     speed.on_train_epoch_end(trainer, module)
     assert logged == {"train/steps_per_second": 2.0}
+
+
+def test_the_epochs_to_nine_tenths_of_the_best_validation():
+    callback, later = Convergence(), Convergence()
+    for epoch, exact in ((1, 0.1), (3, 0.46), (5, 0.44), (7, 0.5)):
+        module = SimpleNamespace(metrics={"val": {"val/exact_match": exact}})
+        callback.on_validation_end(SimpleNamespace(current_epoch=epoch), module)
+        later.load_state_dict(callback.state_dict())  # resumed
+        callback, later = later, Convergence()
+    assert callback.epochs_to(0.9) == 4 and callback.epochs_to(1.0) == 8
 
 
 @pytest.mark.parametrize("columns, bar", [(80, 6), (120, 40)])

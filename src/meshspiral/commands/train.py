@@ -44,9 +44,6 @@ def main(config: TrainConfig) -> None:
         config = resumed_config(config, overrides)
     else:
         claim(folder, config)
-    lengths = [word for word in overrides if word.startswith("seq_len=")]
-    if lengths and "seq_len" not in type(config.neighbourhood).model_fields:
-        log.info("%s: ignored, does not apply to %s", lengths[0], config.neighbourhood.name)
     in_sweep = hydra.mode == RunMode.MULTIRUN
     separate = in_sweep and not is_one_process(config.trainer)
     try:

@@ -127,7 +127,14 @@ def _run_job(
     if folder:
         note_failure(folder, None)
     try:
-        task(read_config(schema, config))
+        settings = read_config(schema, config)
+        lengths = [
+            word for word in hydra_.overrides.task if word.lstrip("+").startswith("seq_len=")
+        ]
+        neighbourhood = getattr(settings, "neighbourhood", None)
+        if lengths and neighbourhood and "seq_len" not in type(neighbourhood).model_fields:
+            log.info("%s: ignored, does not apply to %s", lengths[-1], neighbourhood.name)
+        task(settings)
         return
     except USER_ERRORS as error:
         reason = one_line(error)

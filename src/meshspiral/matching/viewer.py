@@ -86,15 +86,18 @@ class Side:
         }
 
 
-def view_html(match: FileMatch, template: Mesh, up: str, carried: np.ndarray | None) -> str:
+Carried = tuple[np.ndarray, np.ndarray]  # colours of the target, and carried to the source
+
+
+def view_html(match: FileMatch, template: Mesh, up: str, carried: Carried | None) -> str:
     """The page of a match.
 
     Args:
         match: What to show.
         template: The template of the labels; shown beside the source if there is no target.
         up: The template's axis that points up, "y" or "z".
-        carried: Colours of the target's vertices that were carried to the source, [W, 3 or more] in
-            0..255; None for none.
+        carried: Colours of the target's vertices, and those carried to the source's, float [W, 3]
+            and [V, 3] in 0..1; None for none.
     """
     other, source = sides_of(match, template, carried)
     links = [_counterparts(*pair, template.size) for pair in ((other, source), (source, other))]
@@ -118,7 +121,7 @@ def view_html(match: FileMatch, template: Mesh, up: str, carried: np.ndarray | N
     )
 
 
-def sides_of(match: FileMatch, template: Mesh, carried: np.ndarray | None) -> tuple[Side, Side]:
+def sides_of(match: FileMatch, template: Mesh, carried: Carried | None) -> tuple[Side, Side]:
     """The target, or the template without one, and the source."""
     source, target = match.source, match.target
     confidence = source.on_mesh(match.source_confidence)
@@ -140,12 +143,12 @@ def sides_of(match: FileMatch, template: Mesh, carried: np.ndarray | None) -> tu
         near = target.on_mesh(target.labels.near_confidence)
         colors = {"correspondence": target.on_mesh(own), "confidence": confidence_colors(near)}
         if carried is not None:
-            colors["carried"] = target.on_mesh(carried[:, :3] / 255)
+            colors["carried"] = target.on_mesh(carried[0])
         other = _side("target", target, template, near, colors)
         shown = transfer(own, match.map, GREY)
     colors = {"correspondence": source.on_mesh(shown), "confidence": confidence_colors(confidence)}
     if target is not None and carried is not None:
-        colors["carried"] = source.on_mesh(transfer(carried[:, :3] / 255, match.map, GREY))
+        colors["carried"] = source.on_mesh(carried[1])
     return other, _side("source", source, template, confidence, colors)
 
 

@@ -19,7 +19,7 @@ from meshspiral.matching.job import FileMatch, MatchJob
 from meshspiral.matching.pictures import draw_pictures, own_colors
 from meshspiral.matching.transfer import transfer
 from meshspiral.matching.viewer import view_html
-from meshspiral.viz.colors import GREY, point_colors
+from meshspiral.viz.colors import GREY, point_colors, value_colors
 
 RESULT = "match.npz"
 TARGET_FILES = ("target.npz", "target.ply")
@@ -67,13 +67,14 @@ def write_match(job: MatchJob, match: FileMatch, folder: Path) -> None:
     write_integers(folder / "template.txt", labels.template)
     write_file(folder / "remarks.txt", "\n".join(remark_lines(match)) + "\n")
     write_colored_mesh(folder / "source.ply", scan, colors, match.source_confidence)
+    carried_colors = None
     if job.transfer_values is not None:
         values = carried_values(job.transfer_values, match, template, job.config.transfer)
         write_transferred(folder, scan, values, job.config.transfer)
+        carried_colors = colors_of_values(job.transfer_values, values, match, job.config.transfer)
     write_exports(job.config.export, match, template, job.matcher.up, folder)
     if job.render or not job.config.sources:
-        values = job.transfer_values if job.config.transfer == "color" else None
-        page = view_html(match, template, job.matcher.up, values)
+        page = view_html(match, template, job.matcher.up, carried_colors)
         write_file(folder / "view.html", page)
     if job.render:
         required = job.config.picture is True
@@ -206,6 +207,27 @@ def carried_values(values: np.ndarray, match: FileMatch, template: Mesh, kind: s
     if kind == "color":
         rows = np.round(rows)
     return rows.reshape(-1, *values.shape[1:]).astype(values.dtype)
+
+
+def colors_of_values(
+    values: np.ndarray, carried: np.ndarray, match: FileMatch, kind: str
+) -> tuple[np.ndarray, np.ndarray]:
+    """Colours of the target's values and of those carried to the source, for the viewer.
+
+    Args:
+        values: [W, ...], one row per target vertex.
+        carried: [V, ...], from `carried_values`.
+        match: With a target.
+        kind: What they are, as `transfer=` says.
+
+    Returns:
+        float [W, 3] and [V, 3] in 0..1, grey where there is no match.
+    """
+    if kind == "color":
+        target, source = values[:, :3] / 255, carried[:, :3] / 255
+    else:
+        target, source = value_colors(values, values), value_colors(carried, values)
+    return target, np.where(match.map[:, None] < 0, GREY, source)
 
 
 def write_transferred(folder: Path, scan: Scan, values: np.ndarray, kind: str) -> None:

@@ -16,7 +16,8 @@ from meshspiral.viz.colors import ERROR_COLORS, MOST_ERROR
 from meshspiral.viz.pages import fill_page, script_json
 
 # columns that few readers need; a checkbox shows them, or the table would not fit a laptop's screen
-RARE = {METRIC_COLUMNS[key] for key in ("val/exact_match", "parameters", "seconds/train")}
+RARE_KEYS = ("val/exact_match", "parameters", "seconds/train", "epochs/to_90_percent")
+RARE = {METRIC_COLUMNS[key] for key in RARE_KEYS}
 RARE |= {"folder"}
 MOST_SETTINGS = 3  # columns of varied settings; more of them are rare too
 

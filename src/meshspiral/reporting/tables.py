@@ -21,6 +21,7 @@ METRIC_COLUMNS = {
     "val/exact_match": "validation: exact match (%)",
     "parameters": "parameters",
     "seconds/train": "seconds of training",
+    "epochs/to_90_percent": "epochs to 0.9 of its best validation",
 }
 
 
@@ -93,7 +94,7 @@ def format_metric(values: list[float], key: str, deviates: bool = False) -> str:
     """
     if key == "parameters":
         return f"{values[0]:,.0f}"
-    digits = 1 if "%" in METRIC_COLUMNS[key] else 0 if key.startswith("seconds") else 4
+    digits = 1 if "%" in METRIC_COLUMNS[key] else 0 if key.startswith(("seconds", "epochs")) else 4
     deviation = f" ± {np.std(values):.{digits}f}" if deviates else ""
     if np.isnan(values).any():
         return "\u2013"

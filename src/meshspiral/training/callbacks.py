@@ -163,6 +163,31 @@ class Speed(Callback):
         self._earlier, self.waiting = state["seconds"], state.get("waiting", 0.0)
 
 
+class Convergence(Callback):
+    """Remembers all validations of a run, also of one that was resumed.
+
+    Attributes:
+        exact: Share of exact matches on validation, by the number of epochs that were trained.
+    """
+
+    def __init__(self) -> None:
+        self.exact: dict[int, float] = {}
+
+    def epochs_to(self, share: float) -> int:
+        """The first validated epoch with at least this share of the best exact matches."""
+        enough = share * max(self.exact.values())
+        return min(epoch for epoch, exact in self.exact.items() if exact >= enough)
+
+    def on_validation_end(self, trainer: L.Trainer, module: L.LightningModule) -> None:
+        self.exact[trainer.current_epoch + 1] = module.metrics["val"]["val/exact_match"]
+
+    def state_dict(self) -> dict[str, Any]:
+        return {"exact": self.exact}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        self.exact = dict(state["exact"])
+
+
 class Figures(Callback):
     """Draws for TensorBoard: the validation curve, and a validation shape coloured by its
     correspondence.

@@ -18,7 +18,7 @@ from meshspiral.evaluation.outcome import Outcome, evenly
 from meshspiral.experiment.run_folder import BEST, ERRORS, LAST, write_metrics
 from meshspiral.experiment.schema import TrainConfig, flat
 from meshspiral.neighbourhoods import Neighbourhood
-from meshspiral.training.callbacks import Speed
+from meshspiral.training.callbacks import Convergence, Speed
 from meshspiral.training.initial import InitialWeights
 from meshspiral.training.memory import estimate_memory, free_bytes_on, memory_lines
 from meshspiral.training.module import Correspondence
@@ -50,8 +50,8 @@ def train(config: TrainConfig, folder: Path) -> dict[str, float]:
 
     L.seed_everything(config.seed, verbose=False)
     module = Correspondence(config.model_dump(), data.in_features, data.num_classes)
-    speed = Speed()
-    trainer = build_trainer(config, folder, speed)
+    speed, convergence = Speed(), Convergence()
+    trainer = build_trainer(config, folder, speed, convergence)
     data.check_sizes(trainer.world_size)
     parameters = sum(p.numel() for p in module.parameters() if p.requires_grad)
     for line in description_lines(config, data, parameters, trainer.precision, seconds):
@@ -88,6 +88,8 @@ def train(config: TrainConfig, folder: Path) -> dict[str, float]:
         "seconds/train": speed.seconds,
         "seconds/wait": speed.waiting,
     }
+    if convergence.exact:  # empty if an earlier version trained all epochs
+        metrics["epochs/to_90_percent"] = convergence.epochs_to(0.9)
     if trainer.is_global_zero:
         trainer.logger.log_hyperparams(flat(config.model_dump()), tested)
         trainer.logger.finalize("success")
