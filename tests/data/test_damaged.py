@@ -11,7 +11,7 @@ from meshspiral.data.settings import DamageSettings
 from meshspiral.data.shapes import Shape, SurfacePoints
 from meshspiral.experiment.compose import compose_train
 from meshspiral.experiment.schema import ConfigError
-from tests.meshes import icosphere
+from tests.meshes import bumpy_sphere, icosphere, lattice, union
 
 NONE = {
     "noise": 0.0,
@@ -21,6 +21,8 @@ NONE = {
     "cut": 0.0,
     "holes": 0,
     "hole_radius": 0.1,
+    "extremities": 0.0,
+    "component": 0.0,
     "missing": 0.0,
 }
 BODIES = Bodies(1500)
@@ -60,6 +62,32 @@ def test_a_cut_leaves_one_side_of_a_plane(seed):
 def test_holes_larger_than_those_closed_stay():
     shape = apply(3, holes=3, hole_radius=0.3)
     assert len(original_of(shape)) < 1500 and shape.mesh.area < BODY.mesh.area
+
+
+def test_an_extremity_is_cut_off():
+    for seed in range(6):
+        shape = apply(seed, extremities=1.0)
+        left = shape.mesh.vertices
+        lost = np.setdiff1d(np.arange(1500), original_of(shape))
+        gone = BODY.mesh.vertices[lost]
+        assert 10 < len(lost) < 400
+        assert np.linalg.norm(np.ptp(gone, axis=0)) < 2 * np.sqrt(3) * 0.16 * BODY.mesh.size
+        # it lay at an end of the body
+        centre = BODY.mesh.vertices.mean(axis=0)
+        outermost = np.linalg.norm(gone - centre, axis=1).max()
+        assert outermost > np.quantile(np.linalg.norm(left - centre, axis=1), 0.8)
+
+
+def test_a_component_is_removed():
+    two = union(BODY.mesh, bumpy_sphere(), lattice(3, 3))
+    labels = np.arange(len(two.vertices))
+    both = Shape(two, labels, len(labels))
+    for seed in range(4):
+        rng = np.random.default_rng(seed)
+        shape = damaged(both, settings(component=1.0), rng)
+        lost = np.setdiff1d(labels, shape.labels)
+        assert lost.tolist() in (list(range(1500, len(labels) - 9)), list(labels[-9:]))
+    assert len(apply(0, component=1.0).labels) == 1500  # the only one stays
 
 
 def test_missing_faces_are_closed_again_as_before_matching():

@@ -23,7 +23,7 @@ NOISE = {
     "holes": 0,
     "hole_radius": 0.1,
 }
-DAMAGE = DamageSettings(**NOISE, missing=0.0, size=0.0, seed=0)
+DAMAGE = DamageSettings(**NOISE, extremities=0.0, component=0.0, missing=0.0, size=0.0, seed=0)
 FRESH = ["data/damage=scans", "data.damage.share=0", "data.fresh=true"]
 
 

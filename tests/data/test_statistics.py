@@ -116,7 +116,19 @@ def test_registered_shapes_share_all_edges_and_remeshed_ones_few(tmp_path):
 def test_damaged_shapes_are_compared_to_what_was_remeshed(remeshed):
     damage = DamageSettings(
         **dict.fromkeys(
-            ("noise", "warp", "bumps", "share", "cut", "hole_radius", "missing", "size"), 0.0
+            (
+                "noise",
+                "warp",
+                "bumps",
+                "share",
+                "cut",
+                "hole_radius",
+                "extremities",
+                "component",
+                "missing",
+                "size",
+            ),
+            0.0,
         ),
         holes=0,
         seed=0,

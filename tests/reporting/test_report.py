@@ -131,6 +131,8 @@ def test_data_labels_can_be_read(sweep):
         cut=0,
         holes=0,
         hole_radius=0,
+        extremities=0,
+        component=0,
         missing=0,
         size=0,
         seed=0,

@@ -5,6 +5,8 @@ from __future__ import annotations
 import sys
 
 import numpy as np
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 
 from meshspiral.data.cache import code_version
 from meshspiral.data.settings import DamageSettings
@@ -19,6 +21,7 @@ WAVELENGTHS = (0.1, 0.8)  # over the size of the shape
 RIPPLES = 24  # waves of bumps
 RIPPLE_LENGTHS = (0.03, 0.15)  # over the size of the shape
 KEPT = (0.35, 0.9)  # share of the vertices on the kept side of a cut
+EXTREMITY = (0.06, 0.16)  # radius of what is cut off a hand, a foot or the head, over the size
 LEAST = 0.25  # share of the vertices that must be left
 
 
@@ -78,8 +81,12 @@ def damaged(shape: Shape, settings: DamageSettings, rng: np.random.Generator) ->
         for _ in range(rng.integers(settings.holes + 1)):
             radius = rng.uniform(min(SMALLEST_HOLE, settings.hole_radius), settings.hole_radius)
             lost |= around_point(vertices, radius * mesh.size, rng)
+        if settings.extremities and rng.random() < settings.extremities:
+            lost |= at_extremity(vertices, rng.uniform(*EXTREMITY) * mesh.size, rng)
         kept = ~lost[faces].any(axis=1)
         kept &= rng.random(len(faces)) >= rng.uniform(0, settings.missing)
+        if settings.component and rng.random() < settings.component:
+            kept[kept] = without_a_component(faces[kept], rng)
         if len(np.unique(faces[kept])) >= LEAST * len(vertices):
             faces = faces[kept]
     used, faces = used_vertices(faces)
@@ -162,3 +169,29 @@ def around_point(vertices: np.ndarray, radius: float, rng: np.random.Generator) 
     """The vertices in a ball around a random one, bool [V]."""
     centre = vertices[rng.integers(len(vertices))]
     return np.linalg.norm(vertices - centre, axis=1) < radius
+
+
+def at_extremity(vertices: np.ndarray, radius: float, rng: np.random.Generator) -> np.ndarray:
+    """The vertices in a ball around the one that is farthest from a random one, bool [V]."""
+    start = vertices[rng.integers(len(vertices))]
+    end = vertices[np.linalg.norm(vertices - start, axis=1).argmax()]
+    return np.linalg.norm(vertices - end, axis=1) < radius
+
+
+def without_a_component(faces: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """The faces but those of a random component, which is not the largest; all if there is one.
+
+    Args:
+        faces: int [F, 3].
+        rng: Draws the component.
+
+    Returns:
+        bool [F].
+    """
+    edges = np.concatenate([faces[:, :2], faces[:, 1:]])
+    graph = coo_array((np.ones(len(edges), bool), edges.T), shape=2 * (faces.max(initial=0) + 1,))
+    component = connected_components(graph, directed=False)[1][faces[:, 0]]
+    present, sizes = np.unique(component, return_counts=True)
+    if len(present) < 2:
+        return np.ones(len(faces), dtype=bool)
+    return component != rng.choice(np.delete(present, sizes.argmax()))

@@ -80,6 +80,12 @@ class DamageSettings(Strict):
     cut: float = Field(ge=0, le=1, description="share of these that are cut by a plane")
     holes: int = Field(ge=0, description="largest number of holes in these")
     hole_radius: float = Field(ge=0, description="largest radius of a hole")
+    extremities: float = Field(
+        ge=0, le=1, description="share of these that lose a hand, a foot or the head"
+    )
+    component: float = Field(
+        ge=0, le=1, description="share of these that lose a piece, if they consist of several"
+    )
     missing: float = Field(ge=0, lt=1, description="largest share of their faces that is removed")
     size: float = Field(
         ge=0, description="largest relative error of the known size, by which radii are scaled"

@@ -424,7 +424,8 @@ def upgraded(values: dict[str, Any]) -> dict[str, Any]:
     data.setdefault("damage", None)
     if isinstance(data["damage"], dict):
         data["damage"].setdefault("warp", 0.0)
-        data["damage"].setdefault("bumps", 0.0)
+        for later in ("bumps", "extremities", "component"):
+            data["damage"].setdefault(later, 0.0)
     if data.get("name") == "anny":
         data.setdefault("surface", None)
     data.setdefault("features", ["shot"])

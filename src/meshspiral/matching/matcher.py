@@ -57,6 +57,7 @@ MESH_STAGES = (
 )
 Report = Callable[[str], None]  # is told each stage when it begins; not every mesh has all
 FACTORS = (1.0, 1.1, 1.2, 1.3, 1.45, 1.6, 1.8, 2.1, 2.5)  # tried for the size of an open surface
+SEARCHED = 500  # vertices of the mesh on which they are tried, if the network bears so few
 UNIT_ERROR = 50.0  # a complete shape of which a mesh is a smaller or larger part has another unit
 NEAR = 5.0  # mean edges of the template; labels further apart are not interpolated
 # of an ensemble: vertices over those of a training mesh, and size over that of the mesh
@@ -289,8 +290,7 @@ class Matcher:
     def surest_size(self, mesh: Mesh) -> float:
         """The size of the complete surface at which the network is surest of its labels.
 
-        The mean probability of the labels decides, on a mesh with at most as many vertices as one
-        of training.
+        The mean probability of the labels decides, on a mesh of few vertices.
 
         Args:
             mesh: A part of a surface.
@@ -302,8 +302,10 @@ class Matcher:
             MeshError: The mesh cannot be described or resampled.
         """
         mesh = normalize(mesh)
-        if len(mesh.vertices) > self._training_size:
-            mesh = resampled(mesh, self._training_size)
+        least = round(self._training_size / self._predictor.neighbourhood.density_range)
+        vertices = min(self._training_size, max(SEARCHED, least))
+        if len(mesh.vertices) > vertices:
+            mesh = resampled(mesh, vertices)
         area, sure = mesh.area, []
         for factor in FACTORS:
             probability = self._probability(
