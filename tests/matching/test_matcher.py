@@ -6,6 +6,7 @@ import os
 import subprocess
 import sys
 import warnings
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -205,14 +206,34 @@ def test_a_mesh_in_another_unit_than_the_given_one_is_refused(trained, options):
 def test_the_size_of_an_open_surface_is_that_of_which_the_network_is_surest(matcher, monkeypatch):
     half, stages, asked = upper_half(), [], []
 
-    def probability(mesh):
+    def sureness(mesh):
         asked.append(np.sqrt(1 / mesh.area))  # the size of the whole over that of the part
-        return np.full(len(mesh.vertices), np.exp(-((asked[-1] - 1.44) ** 2)))
+        return np.exp(-((asked[-1] - 1.44) ** 2))
 
-    monkeypatch.setattr(matcher, "_probability", probability)
+    monkeypatch.setattr(matcher, "_sureness", sureness)
     sized = matcher._sized(half, stages.append)
     assert sized.size / half.size == pytest.approx(1.45) and stages == ["size"]
     np.testing.assert_allclose(asked, FACTORS, rtol=1e-6)
+
+
+def test_probable_and_smooth_labels_are_sure(matcher, monkeypatch):
+    mesh = matcher.template  # 162 vertices
+    smooth, torn = np.arange(162), np.random.default_rng(0).permutation(162)
+    monkeypatch.setattr(matcher, "_embed", lambda mesh: None)
+
+    def sureness(labels, probability):
+        found = SimpleNamespace(
+            classes=torch.as_tensor(labels), probability=torch.full((162,), probability)
+        )
+        monkeypatch.setattr(matcher._predictor, "predict", lambda embedding: found)
+        return matcher._sureness(mesh)
+
+    assert sureness(smooth, 0.75) > sureness(smooth, 0.5) > sureness(torn, 0.5)
+    lengths = np.linalg.norm(
+        mesh.vertices[mesh.faces] - mesh.vertices[mesh.faces[:, [1, 2, 0]]], axis=2
+    )
+    share = (lengths > 0.15 * mesh.size).mean()
+    assert sureness(smooth, 0.5) == pytest.approx(0.5 - 2 * share)
 
 
 def test_a_surface_without_large_holes_has_its_own_size(matcher):

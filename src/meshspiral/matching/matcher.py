@@ -57,6 +57,8 @@ MESH_STAGES = (
 )
 Report = Callable[[str], None]  # is told each stage when it begins; not every mesh has all
 FACTORS = (1.0, 1.1, 1.2, 1.3, 1.45, 1.6, 1.8, 2.1, 2.5)  # tried for the size of an open surface
+JUMP = 0.15  # over the template's size: labels of neighbours that are further apart are wrong
+JUMPS = 2.0  # how much their share counts against the mean probability of the labels
 SEARCHED = 500  # vertices of the mesh on which they are tried, if the network bears so few
 UNIT_ERROR = 50.0  # a complete shape of which a mesh is a smaller or larger part has another unit
 NEAR = 5.0  # mean edges of the template; labels further apart are not interpolated
@@ -290,7 +292,8 @@ class Matcher:
     def surest_size(self, mesh: Mesh) -> float:
         """The size of the complete surface at which the network is surest of its labels.
 
-        The mean probability of the labels decides, on a mesh of few vertices.
+        The mean probability of the labels decides, less twice the share of the edges between whose
+        labels the template is torn, on a mesh of few vertices.
 
         Args:
             mesh: A part of a surface.
@@ -308,16 +311,18 @@ class Matcher:
             mesh = resampled(mesh, vertices)
         area, sure = mesh.area, []
         for factor in FACTORS:
-            probability = self._probability(
-                normalize(replace(mesh, complete_area=factor**2 * area))
-            )
-            sure.append(np.average(probability, weights=mesh.vertex_areas))
+            sure.append(self._sureness(normalize(replace(mesh, complete_area=factor**2 * area))))
         return FACTORS[int(np.argmax(sure))]
 
-    def _probability(self, mesh: Mesh) -> np.ndarray:
-        """The probability of the label of every vertex, float [W]."""
-        embedding = self._embed(mesh)
-        return self._predictor.predict(embedding).probability.float().cpu().numpy()
+    def _sureness(self, mesh: Mesh) -> float:
+        """How sure the network is of the labels of a mesh, and how smooth they are."""
+        found = self._predictor.predict(self._embed(mesh))
+        probability = found.probability.float().cpu().numpy()
+        points = self.template.vertices[found.classes.cpu().numpy()] / self.template.size
+        edges = mesh.faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
+        apart = np.linalg.norm(points[edges[:, 0]] - points[edges[:, 1]], axis=1)
+        mean = np.average(probability, weights=mesh.vertex_areas)
+        return float(mean - JUMPS * (apart > JUMP).mean())
 
     def _needs_resampling(self, vertices: int) -> bool:
         if self._resampled is not None:
