@@ -23,7 +23,8 @@ def test_copies_have_other_densities_and_sizes_and_are_carried_back(monkeypatch)
 
     monkeypatch.setattr(matcher, "_embed", positions)
     found = matcher._with_copies(BODY, positions(BODY))
-    assert [count for count, _ in seen] == pytest.approx([1500, 989, 1373, 1895], rel=0.01)
+    counts = [1500, *(share * matcher._training_size for share, _ in module.COPIES)]
+    assert [count for count, _ in seen] == pytest.approx(counts, rel=0.01)
     np.testing.assert_allclose([size for _, size in seen], [1, 0.96, 1, 1.04])
     off = np.linalg.norm(found.numpy() - BODY.vertices, axis=1)
     assert 0 < np.median(off) < 0.003 and off.max() < 0.03
