@@ -123,20 +123,7 @@ def test_runs_that_differ_in_the_seed_alone_are_one_group(sweep):
 def test_data_labels_can_be_read(sweep):
     """Settings of training shapes alone tell groups apart, but not the data sets."""
     run = read_runs(str(sweep))[0][0]
-    damage = DamageSettings(
-        noise=0.002,
-        warp=0,
-        bumps=0,
-        share=0,
-        cut=0,
-        holes=0,
-        hole_radius=0,
-        extremities=0,
-        component=0,
-        missing=0,
-        size=0,
-        seed=0,
-    )
+    damage = DamageSettings(**dict.fromkeys(DamageSettings.model_fields, 0) | {"noise": 0.002})
     runs = [run, *(changed(run, data=data) for data in ({"fresh": True}, {"damage": damage}))]
     assert data_labels(runs) == ["folder"] * 3
     assert varied_settings(runs) == ["data.damage", "data.fresh"]

@@ -5,8 +5,7 @@ from __future__ import annotations
 import sys
 
 import numpy as np
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
+from trimesh.graph import connected_component_labels
 
 from meshspiral.data.cache import code_version
 from meshspiral.data.settings import DamageSettings
@@ -188,9 +187,9 @@ def without_a_component(faces: np.ndarray, rng: np.random.Generator) -> np.ndarr
     Returns:
         bool [F].
     """
-    edges = np.concatenate([faces[:, :2], faces[:, 1:]])
-    graph = coo_array((np.ones(len(edges), bool), edges.T), shape=2 * (faces.max(initial=0) + 1,))
-    component = connected_components(graph, directed=False)[1][faces[:, 0]]
+    edges = faces[:, [0, 1, 1, 2]].reshape(-1, 2)  # two edges connect a face's corners
+    labels = connected_component_labels(edges, node_count=faces.max(initial=0) + 1)
+    component = labels[faces[:, 0]]
     present, sizes = np.unique(component, return_counts=True)
     if len(present) < 2:
         return np.ones(len(faces), dtype=bool)
