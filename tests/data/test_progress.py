@@ -42,8 +42,20 @@ def test_a_file_gets_lines_without_bars(monkeypatch, every, leave):
 
 def test_short_work_leaves_a_file_empty(monkeypatch):
     monkeypatch.setattr(sys, "stderr", io.StringIO())
-    work()
+    with Progress(total=2) as bar:
+        for stage in ("reading", "labelling"):
+            bar.set_description_str(stage)
+            bar.update()
     assert sys.stderr.getvalue() == ""
+
+
+def test_a_description_waits_for_the_next_line(monkeypatch, every):
+    monkeypatch.setattr(sys, "stderr", io.StringIO())
+    with Progress(total=9, delay=0.01, leave=False) as bar:
+        for stage in range(9):
+            bar.set_description_str(f"stage {stage}")
+            time.sleep(0.02)
+    assert 1 <= sys.stderr.getvalue().count("\n") <= 5
 
 
 def test_a_terminal_gets_one_bar_in_place(monkeypatch):

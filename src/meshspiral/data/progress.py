@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import re
 import sys
+import time
 from typing import Any, TextIO
 
 from tqdm import tqdm
@@ -30,6 +31,15 @@ class Progress(tqdm):
             options |= {"mininterval": EVERY, "bar_format": LINE, "file": Lines(sys.stderr)}
             options.setdefault("delay", 1.0)
         super().__init__(*args, **options)
+
+    def refresh(self, *args: Any, **options: Any) -> None:
+        """Show the present state; in a file, once the next line is due."""
+        now = time.time()
+        if in_place(sys.stderr):
+            super().refresh(*args, **options)
+        elif now - self.last_print_t >= self.mininterval and now >= self.start_t + self.delay:
+            super().refresh(*args, **options)
+            self.last_print_t = now
 
 
 class Lines:
