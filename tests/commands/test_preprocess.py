@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 from safetensors.numpy import load
 
-from meshspiral.commands import preprocess, train
+from meshspiral.commands import cache, preprocess, train
 from meshspiral.data.datasets.folder import Folder
 from meshspiral.data.pool import on_cluster, run_all
 from meshspiral.data.shapes import DataError
@@ -40,6 +40,27 @@ def test_training_after_it_reads_no_mesh(cli, arguments, toy_overrides, tmp_path
     code, out, err = cli(*own, program=train.main)
     assert code == 0, err
     assert set(read) == {"val_0"}  # drawn in TensorBoard
+
+
+def test_the_rest_of_the_cache_can_be_removed(cli, arguments, tmp_path):
+    """What was prepared counts as read, although it was there before; all else is old."""
+    remeshed = ["data/remesh=isotropic", "data.remesh.vertices=100"]
+    cli(*arguments, *remeshed, program=preprocess.main)
+    wanted = entries(tmp_path / "cache")
+    cli(*arguments, "seq_len=9", program=preprocess.main)
+    cli(*arguments, "data.shot.bins=5", program=preprocess.main)
+    assert wanted < entries(tmp_path / "cache")
+    a_day_ago = time.time() - 86400
+    for path in (tmp_path / "cache").glob("*/*"):
+        os.utime(path, (a_day_ago, a_day_ago))
+    cli(*arguments, *remeshed, program=preprocess.main)
+    code, out, err = cli(f"cache_dir={tmp_path / 'cache'}", "unused_days=0.5", program=cache.main)
+    assert code == 0, err
+    assert entries(tmp_path / "cache") == wanted
+
+
+def entries(folder: Path) -> set[str]:
+    return {str(path.relative_to(folder)) for path in folder.glob("*/*")}
 
 
 @pytest.mark.parametrize(

@@ -20,7 +20,7 @@ def main(config: PreprocessConfig) -> None:
     splits = [split for split, names in data.shapes.names.items() if names]
     began = time.perf_counter()
     with on_cluster(config.scheduler):
-        data.prepare(splits)
+        data.prepare(splits, visit=True)
     data.reference.prepare()
     seconds = time.perf_counter() - began
     meshes = sum(len(data.datasets[split]) for split in splits)

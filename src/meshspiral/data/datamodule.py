@@ -120,8 +120,12 @@ class CorrespondenceData(L.LightningDataModule):
         if wanted:
             self.prepare(wanted)
 
-    def prepare(self, wanted: list[str] | tuple[str, ...] = SPLITS) -> None:
+    def prepare(self, wanted: list[str] | tuple[str, ...] = SPLITS, visit: bool = False) -> None:
         """Compute what is not cached for these splits.
+
+        Args:
+            wanted: The splits.
+            visit: See `Recipe.prepare_all`.
 
         Raises:
             DataError: A split has no mesh, or a shape is wrong.
@@ -132,7 +136,7 @@ class CorrespondenceData(L.LightningDataModule):
             if not self.shapes.names[split]:
                 raise DataError(f"the split {split} must have at least 1 mesh, got 0")
         names = [name for split in wanted for name in self.shapes.names[split]]
-        prepared = self.recipe.prepare_all(names, self.workers)
+        prepared = self.recipe.prepare_all(names, self.workers, visit)
         repeated = Counter(each.table for each in prepared)
         tables = {key: None for key, count in repeated.items() if count > 1}
         rest = iter(prepared)

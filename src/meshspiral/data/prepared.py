@@ -89,18 +89,26 @@ class Recipe:
         rng = np.random.default_rng(derived_seed(self.shuffle, "shuffle", name))
         return shape.renumbered(rng.permutation(len(shape.labels)))
 
-    def prepare_all(self, names: Sequence[str], workers: int | None) -> list[Prepared]:
+    def prepare_all(
+        self, names: Sequence[str], workers: int | None, visit: bool = False
+    ) -> list[Prepared]:
         """Compute what the cache lacks for these shapes, in worker processes if that is faster.
 
         If all of it was computed before, and no file of the data set has changed since, no mesh is
         read.
+
+        Args:
+            names: The shapes.
+            workers: Number of processes; None for one per core.
+            visit: Go through all meshes nevertheless, so that all results that they need count as
+                read now, see `Cache.prune`.
 
         Raises:
             DataError, MeshError: A shape is unusable, or a worker process was killed.
             CacheError: The cache cannot be written.
         """
         manifest = self._manifest(names)
-        found = read_manifest(manifest, names) if manifest else None
+        found = read_manifest(manifest, names) if manifest and not visit else None
         if found is None:
             noun = f"Descriptors and {self.neighbourhood.noun}"
             found = run_all(self.prepare, names, workers, noun)
