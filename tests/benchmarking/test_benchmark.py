@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from meshspiral.benchmarking import measure, memory, scaling, steps
+from meshspiral.benchmarking import measure, memory, scaling, steps, waiting
 from meshspiral.benchmarking import preprocessing as preprocessing_part
 from meshspiral.benchmarking.inputs import torus_batch
 from meshspiral.benchmarking.products import ProductRecorder
@@ -91,6 +91,7 @@ def small_sizes(monkeypatch):
     monkeypatch.setattr(memory, "LARGE", (60, 90))
     monkeypatch.setattr(scaling, "SIZES", [40, 60, 90])
     monkeypatch.setattr(scaling, "LENGTHS", [2, 4, 6])
+    monkeypatch.setattr(waiting, "MESHES", 2)
 
 
 def test_every_part_has_its_table_and_its_entry_in_the_file(
@@ -100,7 +101,8 @@ def test_every_part_has_its_table_and_its_entry_in_the_file(
     code, out, err = cli(*words, "models=[fcs,gcnn3]", program=benchmark.main)
     assert code == 0, err
     result = json.loads((tmp_path / "out" / "benchmark.json").read_text())
-    assert result.keys() == {"machine", "config", "steps", "memory", "preprocessing", "scaling"}
+    config_parts = ["steps", "memory", "preprocessing", "waiting", "scaling"]
+    assert result.keys() == {"machine", "config", *config_parts}
     assert result["config"]["seq_len"] == 4
     assert [row["network"] for row in result["steps"]] == ["fcs", "gcnn3"]
     for row in result["steps"]:
@@ -110,6 +112,9 @@ def test_every_part_has_its_table_and_its_entry_in_the_file(
     names = [row["what"] for row in result["preprocessing"]]
     assert names[0] == "shot" and names[1] == "spirals of 4 vertices"
     assert names[2].startswith("patches of 5 x 16") and names[3] == "everything"
+    for row in result["waiting"]:
+        assert row["steps"] == 2 and 0 < row["waiting"] < 0.5 * row["seconds"]
+        assert row["waiting / seconds"] == pytest.approx(row["waiting"] / row["seconds"])
     assert {row["template"] for row in result["memory"]} == {1500, 90}
     assert len(result["memory"]) == 6
     assert [(row["what"], row["over"]) for row in result["scaling"]] == [
@@ -121,6 +126,15 @@ def test_every_part_has_its_table_and_its_entry_in_the_file(
     ]
     assert all(len(row["seconds"]) == len(row["MB"]) == 3 for row in result["scaling"])
     assert (tmp_path / "out" / "scaling.png").stat().st_size > 10_000
+
+
+def test_preprocessing_of_all_bodies_is_omitted_if_it_takes_long(monkeypatch, three_bodies, caplog):
+    config = benchmark.BenchmarkConfig.model_construct(repeats=1)
+    monkeypatch.setattr(preprocessing_part, "medians", lambda actions, _: dict.fromkeys(actions, 9))
+    monkeypatch.setattr(preprocessing_part, "LONGEST", 0.1)
+    rows = preprocessing_part.preprocessing_rows(config, [small("fcs")])
+    assert [row["what"] for row in rows] == ["shot", "spirals of 4 vertices"]
+    assert "all 3 bodies: omitted, about" in caplog.text
 
 
 PLUGIN = '''
@@ -244,7 +258,7 @@ def test_overrides_are_settings_of_the_networks_to_measure(cli, monkeypatch):
     "argument, message",
     [
         ("vertices=3", "vertices must be one of 1500, 6890, got 3"),
-        ("parts=[naps]", "must be one of steps, memory, preprocessing, scaling, got naps"),
+        ("parts=[naps]", "must be one of steps, memory, preprocessing, waiting, scaling, got naps"),
         ("repeats=0", "repeats must be at least 1, got 0"),
         ("+depth=1", "unknown key depth"),
         ("models=[x]", "models must be of acnn, conv, diffusion, fcs, gcnn3, lstm, monet, got x"),

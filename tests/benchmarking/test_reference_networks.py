@@ -35,7 +35,7 @@ def network_and_batch(model, *more):
     return network_of(config, CLASSES).double(), in_double(batch)
 
 
-@pytest.mark.parametrize("model", ["fcs", "lstm"])
+@pytest.mark.parametrize("model", ["conv", "fcs", "lstm"])
 def test_losses_with_metric_information_agree(model):
     net, batch = network_and_batch(model, "metric=true")
     ours, theirs = training_loss(net, batch), reference_loss(reference_network(net), batch)
@@ -57,12 +57,13 @@ def test_losses_and_gradients_agree_to_1e_9(model):
         torch.testing.assert_close(parameter.grad, expected[name].grad, rtol=0, atol=1e-9)
 
 
-@pytest.mark.parametrize("model", ["fcs", "lstm", "gcnn3"])
+@pytest.mark.parametrize("model", MODELS)
 def test_every_layer_of_the_bundled_networks_has_a_reference(model):
     net, _ = network_and_batch(model)
     copy = reference_network(net)
-    expected = [reference.REFERENCES[type(layer)] for layer in net.layers]
-    assert [type(layer) for layer in copy.layers] == expected
+    layers = [each.blocks if model == "diffusion" else each.layers for each in (net, copy)]
+    expected = [reference.REFERENCES[type(layer)] for layer in layers[0]]
+    assert [type(layer) for layer in layers[1]] == expected
     pointers = [{p.data_ptr() for p in each.parameters()} for each in (net, copy)]
     assert not pointers[0] & pointers[1]  # the copy has weights of its own
 

@@ -54,7 +54,7 @@ def test_the_rest_of_the_cache_can_be_removed(cli, arguments, tmp_path):
     for path in (tmp_path / "cache").glob("*/*"):
         os.utime(path, (a_day_ago, a_day_ago))
     cli(*arguments, *remeshed, program=preprocess.main)
-    code, out, err = cli(f"cache_dir={tmp_path / 'cache'}", "unused_days=0.5", program=cache.main)
+    code, _, err = cli(f"cache_dir={tmp_path / 'cache'}", "unused_days=0.5", program=cache.main)
     assert code == 0, err
     assert entries(tmp_path / "cache") == wanted
 

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import logging
 import tempfile
 import time
 from collections.abc import Callable
 from functools import partial
+
+from joblib import cpu_count
 
 from meshspiral.benchmarking.inputs import first_body
 from meshspiral.benchmarking.measure import Row, medians
@@ -24,11 +27,15 @@ from meshspiral.experiment.schema import BenchmarkConfig, TrainConfig
 from meshspiral.geometry.mesh import Mesh
 from meshspiral.neighbourhoods import Neighbourhood
 
+log = logging.getLogger(__name__)
+LONGEST = 600.0
+
 
 def preprocessing_rows(config: BenchmarkConfig, networks: list[TrainConfig]) -> list[Row]:
     """A row for the descriptors, for each neighbourhood of the networks, and for everything.
 
-    The last row is everything for all bodies, with all cores, from an empty cache.
+    The last row is everything for all bodies, with all cores, from an empty cache. It is omitted if
+    it would take more than `LONGEST` seconds.
     """
     data, makers = networks[0].data, dict[str, Callable[[Mesh], Task]]()
     mesh = first_body(networks[0]).mesh
@@ -43,10 +50,15 @@ def preprocessing_rows(config: BenchmarkConfig, networks: list[TrainConfig]) -> 
         config.repeats,
     )
     rows: list[Row] = [{"what": name, "meshes": 1, "seconds": s} for name, s in seconds.items()]
+    shapes = open_shapes(data)
+    names = [name for split in shapes.names.values() for name in split]
+    expected = sum(seconds.values()) * len(names) / cpu_count()
+    if expected > LONGEST:
+        minutes = expected / 60
+        log.warning("all %d bodies: omitted, about %.0f minutes", len(names), minutes)
+        return rows
     with tempfile.TemporaryDirectory() as folder:
         began = time.perf_counter()
-        shapes = open_shapes(data)
-        names = [name for split in shapes.names.values() for name in split]
         meshes = [shapes.load(name).mesh for name in names]
         every_task = (make(mesh) for mesh in meshes for make in makers.values())
         run_tasks(every_task, Cache(folder), None, "Bodies")

@@ -24,6 +24,7 @@ def main(config: BenchmarkConfig) -> None:
     from meshspiral.benchmarking.scaling import scaling_rows
     from meshspiral.benchmarking.steps import step_rows
     from meshspiral.benchmarking.table import table_lines
+    from meshspiral.benchmarking.waiting import waiting_rows
     from meshspiral.training.device import device_of, set_up_process
     from meshspiral.viz.plots import encoded, scaling_figure
 
@@ -31,6 +32,7 @@ def main(config: BenchmarkConfig) -> None:
         "steps": step_rows,
         "memory": memory_rows,
         "preprocessing": preprocessing_rows,
+        "waiting": waiting_rows,
         "scaling": scaling_rows,
     }
     folder = Path(HydraConfig.get().runtime.output_dir)

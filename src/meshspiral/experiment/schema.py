@@ -335,7 +335,7 @@ class BenchmarkConfig(Strict):
     threads: Threads
     models: list[str] = Field(description="networks to measure")
     overrides: list[str] = Field(description="settings of `train` for all of them")
-    parts: list[Literal["steps", "memory", "preprocessing", "scaling"]] = Field(
+    parts: list[Literal["steps", "memory", "preprocessing", "waiting", "scaling"]] = Field(
         description="what to measure"
     )
     plugins: Plugins
