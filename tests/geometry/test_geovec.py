@@ -7,9 +7,11 @@ import pytest
 from scipy.integrate import quad
 
 from meshspiral.data.datasets.bodies import Bodies
+from meshspiral.geometry.barycentric import interpolate
 from meshspiral.geometry.geovec import cubic_spline, geometry_vectors
 from meshspiral.geometry.laplacian import Spectrum, spectrum
 from meshspiral.geometry.mesh import Mesh
+from meshspiral.geometry.remesh import remesh
 from tests.geometry.test_sampling import split_faces
 from tests.meshes import bumpy_sphere, icosphere, lattice
 
@@ -89,3 +91,15 @@ def test_two_tessellations_of_a_body_agree():
     difference = np.linalg.norm(one - two, axis=1)
     apart = np.linalg.norm(one - one[np.random.default_rng(0).permutation(1500)], axis=1)
     assert np.median(difference) < 0.3 * np.median(apart)
+
+
+def test_a_surface_and_its_remesh_agree():
+    """In the lower bands: the higher the frequency, the more the triangles matter."""
+    source = bumpy_sphere(1, subdivisions=3, bump=0.4)
+    made = remesh(source, 500, "simplified", seed=0)
+    one = interpolate(vectors(source, 20, 30), source.faces[made.faces], made.weights)
+    two = vectors(made.mesh, 20, 30)
+    distances = np.linalg.norm(one[:, None] - two, axis=2)
+    own = distances.diagonal()
+    assert np.median(own) < 0.3 * np.median(distances)
+    assert (distances < own[:, None]).mean() < 0.02  # few other vertices are as near
