@@ -26,15 +26,17 @@ def test_the_worst_match_comes_first_and_unfinished_ones_not_at_all(tmp_path):
     html = (tmp_path / "index.html").read_text()
     assert re.findall(r'href="(.*?)"', html) == ["bad/remarks.txt", "good/remarks.txt"]
     assert "2 matches in" in html and "below 0.5 at 66.7 %" in html
-    assert "c.ply: no usable face &lt;here&gt;" in html and "With <code>picture=true" in html
+    assert "c.ply: no usable face &lt;here&gt;" in html and "Without <code>picture=false" in html
+    assert not (tmp_path / "plotly.min.js").exists()
 
 
 def test_a_match_with_pictures_has_a_thumbnail_that_leads_to_its_page(tmp_path):
-    match(tmp_path / "a b#", [0.9], files=("view.html", "correspondence.png"))
+    match(tmp_path / "a b#", [0.9], files=("view.html", "thumbnail.png"))
     write_index(tmp_path, ["a b#"], [])
     html = (tmp_path / "index.html").read_text()
-    assert '<a href="a%20b%23/view.html"><img src="a%20b%23/correspondence.png"' in html
-    assert "picture=true" not in html
+    assert '<a href="a%20b%23/view.html"><img src="a%20b%23/thumbnail.png"' in html
+    assert "picture=false" not in html
+    assert (tmp_path / "plotly.min.js").stat().st_size > 1e6
 
 
 def test_vertices_without_a_label_do_not_count(tmp_path):

@@ -210,8 +210,14 @@ def test_a_mesh_that_a_repair_cut_open_is_rendered(cli, trained, files):
     code, out, _ = cli(*sources, program=main)
     assert code == 0 and "1 repaired" in out
     assert "cut open" in Path("many/a/remarks.txt").read_text()
+    assert 'src="../plotly.min.js"' in Path("many/a/view.html").read_text()
+    assert Path("many/a/thumbnail.png").read_bytes().startswith(b"\x89PNG")
+    assert Path("many/plotly.min.js").is_file()
     code, out, _ = cli(*sources, "picture=true", program=main)
     assert code == 0 and Path("many/a/correspondence.png").exists()
+    code, out, _ = cli(*sources, "picture=false", program=main)
+    assert code == 0 and not list(Path("many/a").glob("*.png"))
+    assert not Path("many/a/view.html").exists()
 
 
 def test_without_opengl_renders_are_skipped(cli, trained, files, monkeypatch):

@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 import base64
+import io
 import json
 import re
 import shutil
 
 import numpy as np
 import pytest
+from matplotlib import pyplot as plt
 
 from meshspiral import Matcher, scan
 from meshspiral.matching import viewer
 from meshspiral.matching.job import FileMatch, LabelledScan
-from meshspiral.matching.viewer import view_html
 from meshspiral.matching.writing import colors_of_values
 from meshspiral.viz.colors import GREY
 from tests.conftest import toy_shapes
@@ -61,8 +62,14 @@ def unpacked(text: str, dtype: type) -> np.ndarray:
     return np.frombuffer(base64.b64decode(text), dtype)
 
 
+def page_of(match, matcher, carried=None, script=None) -> str:
+    template = matcher.template
+    sides = viewer.sides_of(match, template, carried)
+    return viewer.view_html(sides, match, template, matcher.up, script)
+
+
 def test_the_page_holds_the_map_and_its_confidence(matcher, match):
-    html = view_html(match, matcher.template, matcher.up, None)
+    html = page_of(match, matcher)
     target, source = data_of(html)
     assert (target["noun"], source["noun"]) == ("target", "source")
     np.testing.assert_array_equal(unpacked(source["other"], np.int32), match.map)
@@ -81,13 +88,31 @@ def test_two_bodies_of_10000_vertices_fit_into_8_mb(matcher, match):
     large = match.source._replace(scan=scan(mesh.vertices, mesh.faces, "a.ply"), labels=labels)
     both = FileMatch("a.ply", large, large, match.map[rows], match.confidence[rows])
     colors = np.full((len(rows), 3), 0.5)
-    html = view_html(both, matcher.template, matcher.up, (colors, colors))
+    html = page_of(both, matcher, (colors, colors))
     assert len(unpacked(data_of(html)[1]["vertex"], np.int32)) > 10000 and len(html) < 8e6
+
+
+def test_a_page_without_the_script_names_it(matcher, match):
+    page, alone = page_of(match, matcher, script="../plotly.min.js"), page_of(match, matcher)
+    assert '<script src="../plotly.min.js"></script>' in page
+    assert len(alone) > len(page) + 4e6
+    assert data_of(page) == data_of(alone)
+
+
+def test_the_thumbnail_shows_both_sides(matcher, match):
+    image = plt.imread(io.BytesIO(viewer.thumbnail(viewer.sides_of(match, matcher.template), "y")))
+    drawn = (image[..., :3] < 0.99).any(axis=(0, 2))  # columns that are not white
+    edges = np.flatnonzero(np.diff(drawn.astype(int)))
+    assert len(edges) >= 3  # a gap between them
+    middle = image.shape[1] // 2
+    for half in (image[:, :middle], image[:, middle:]):
+        colors = half[(half[..., :3] < 0.99).any(axis=2)][:, :3]
+        assert len(colors) > 0.2 * half.shape[0] * half.shape[1] and colors.std(axis=0).max() > 0.1
 
 
 def test_without_a_target_the_template_is_beside_the_source(matcher, match):
     alone = FileMatch("a.ply", match.source, None, None, None)
-    template, source = data_of(view_html(alone, matcher.template, matcher.up, None))
+    template, source = data_of(page_of(alone, matcher))
     assert template["noun"] == "template"
     np.testing.assert_array_equal(unpacked(source["other"], np.int32), match.source.labels.template)
     of_template = unpacked(template["confidence"], np.float32)
@@ -101,7 +126,7 @@ def test_without_a_target_the_template_is_beside_the_source(matcher, match):
 def test_carried_colours_can_be_shown(matcher, match):
     of_target, of_source = np.random.default_rng(0).integers(256, size=(2, 162, 3))
     carried = of_target / 255, of_source / 255
-    html = view_html(match, matcher.template, matcher.up, carried)
+    html = page_of(match, matcher, carried)
     target, source = data_of(html)
     assert '<option value="carried">carried from the target</option>' in html
     colors = unpacked(target["colors"]["carried"], np.uint8).reshape(-1, 3)
@@ -129,7 +154,7 @@ def test_values_of_any_kind_have_colours(match):
 
 def test_large_meshes_are_thinned_and_the_page_says_so(matcher, match, monkeypatch):
     monkeypatch.setattr(viewer, "MOST_VERTICES", 80)
-    html = view_html(match, matcher.template, matcher.up, None)
+    html = page_of(match, matcher)
     target, source = data_of(html)
     shown = unpacked(source["vertex"], np.int32)
     assert len(shown) <= 85
@@ -142,7 +167,7 @@ def test_a_name_cannot_end_the_script(matcher, match):
     mesh = match.source.scan.mesh
     named = type(mesh)(mesh.vertices, mesh.faces, "</script><b>.ply")
     source = match.source._replace(scan=match.source.scan._replace(mesh=named))
-    html = view_html(match._replace(source=source), matcher.template, matcher.up, None)
+    html = page_of(match._replace(source=source), matcher)
     assert "</script><b>" not in html
 
 
@@ -151,7 +176,7 @@ def test_the_mark_follows_the_pointer(matcher, match, tmp_path):
     from playwright.sync_api import sync_playwright
 
     path = tmp_path / "view.html"
-    path.write_text(view_html(match, matcher.template, matcher.up, None))
+    path.write_text(page_of(match, matcher))
     target, source = data_of(path.read_text())
     tips = [unpacked(side["tips"], np.float32).reshape(3, -1).T for side in (target, source)]
     errors, requests = [], []

@@ -109,6 +109,16 @@ def test_a_flat_mesh_is_drawn():
         assert picture.images[0].shape[1] < 25 * picture.images[0].shape[0]
 
 
+def test_a_sketch_shows_the_inside_through_a_hole_darker():
+    sheet = lattice(4, 4)
+    colors = np.ones((16, 3))
+    front, back = (
+        sketch_figure(sheet.vertices, faces, colors).axes[0].collections[0].get_facecolor()[:, 0]
+        for faces in (sheet.faces, sheet.faces[:, ::-1])
+    )
+    np.testing.assert_allclose([front, back], [np.ones(18), np.full(18, 0.5)])
+
+
 def test_neighbourhoods_of_one_point_are_seen_from_one_side():
     """Although the normal at it differs between two tessellations."""
     mesh = bumpy_sphere(2)

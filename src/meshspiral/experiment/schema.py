@@ -221,7 +221,10 @@ class MatchConfig(Strict):
         description="also write, one or a list: dense, points in the target's faces as NumPy and "
         "CSV; registered, the source with the template's connectivity; morph, an animated GLB"
     )
-    picture: bool | None = Field(description="render; null: with source= yes, with sources= no")
+    picture: bool | None = Field(
+        description="render; null: with source= yes, with sources= no; false: with sources= no "
+        "pages and thumbnails either"
+    )
     accelerator: Accelerator
     workers: int | None = Field(ge=1, description="processes, with sources=; null: one per core")
     plugins: Plugins

@@ -8,9 +8,10 @@ from typing import NamedTuple
 from urllib.parse import quote
 
 import numpy as np
+from plotly.offline import get_plotlyjs
 
 from meshspiral.data.files import write_file
-from meshspiral.matching.writing import RESULT
+from meshspiral.matching.writing import RESULT, SCRIPT, THUMBNAIL
 from meshspiral.viz.pages import fill_page
 
 INDEX = "index.html"
@@ -36,7 +37,7 @@ class Entry(NamedTuple):
 
 
 def write_index(folder: Path, names: Iterable[str], refused: Iterable[str]) -> None:
-    """Write index.html.
+    """Write index.html, and the script that the pages of the matches share.
 
     Args:
         folder: The folder of all matches.
@@ -52,6 +53,8 @@ def write_index(folder: Path, names: Iterable[str], refused: Iterable[str]) -> N
         refused=sorted(refused),
         pictured=any(entry.picture for entry in entries),
     )
+    if any(entry.picture for entry in entries):
+        write_file(folder / SCRIPT, get_plotlyjs())
     write_file(folder / INDEX, html)
 
 
@@ -64,8 +67,8 @@ def read_entry(folder: Path, name: str) -> Entry | None:
     except (OSError, ValueError, KeyError):
         return None
     page = "view.html" if (folder / name / "view.html").exists() else "remarks.txt"
-    picture = f"{quote(name)}/correspondence.png"
-    has_picture = (folder / name / "correspondence.png").exists()
+    picture = f"{quote(name)}/{THUMBNAIL}"
+    has_picture = (folder / name / THUMBNAIL).exists()
     median = float(np.median(confidence)) if len(confidence) else 0.0
     unsure = float((confidence < UNSURE).mean()) if len(confidence) else 1.0
     return Entry(name, f"{quote(name)}/{page}", picture if has_picture else None, median, unsure)

@@ -84,6 +84,7 @@ class MatchJob:
 
     def __init__(self, config: MatchConfig, render: bool):
         self.config, self.render = config, render
+        self.with_page = not config.sources or config.picture is not False
 
     def __reduce__(self) -> tuple[Callable[..., Any], tuple[str, bool]]:
         return _job_of_process, (self.config.model_dump_json(), self.render)
@@ -173,7 +174,7 @@ class MatchJob:
     def _shared_key(self) -> str:
         files = [str(Path(self.config.run or BUNDLED_RUN) / BEST), *self.inputs]
         settings = self.config.model_dump_json(exclude=NOT_IN_KEY)
-        return digest(*map(_content, files), settings, self.render, CONTENT)
+        return digest(*map(_content, files), settings, self.render, self.with_page, CONTENT)
 
 
 @lru_cache(maxsize=1)

@@ -16,6 +16,7 @@ from meshspiral.matching.pictures import align_to_template, own_colors
 from meshspiral.matching.transfer import transfer
 from meshspiral.viz.colors import GREY, confidence_colors, point_colors, template_colors
 from meshspiral.viz.pages import fill_page, pack_array, script_json
+from meshspiral.viz.plots import encoded, sketch_figure
 from meshspiral.viz.render import upright
 
 MOST_VERTICES = 20_000  # shown of a mesh; a larger one is thinned
@@ -89,17 +90,19 @@ class Side:
 Carried = tuple[np.ndarray, np.ndarray]  # colours of the target, and carried to the source
 
 
-def view_html(match: FileMatch, template: Mesh, up: str, carried: Carried | None) -> str:
+def view_html(
+    sides: tuple[Side, Side], match: FileMatch, template: Mesh, up: str, script: str | None = None
+) -> str:
     """The page of a match.
 
     Args:
+        sides: Of `sides_of`.
         match: What to show.
-        template: The template of the labels; shown beside the source if there is no target.
+        template: The template of the labels.
         up: The template's axis that points up, "y" or "z".
-        carried: Colours of the target's vertices, and those carried to the source's, float [W, 3]
-            and [V, 3] in 0..1; None for none.
+        script: The path of Plotly's script, relative to the page; None to write it into the page.
     """
-    other, source = sides_of(match, template, carried)
+    other, source = sides
     links = [_counterparts(*pair, template.size) for pair in ((other, source), (source, other))]
     found = match.source.labels.template if match.map is None else match.map
     links[1] = _mapped(source, other, found, template.size)
@@ -107,7 +110,7 @@ def view_html(match: FileMatch, template: Mesh, up: str, carried: Carried | None
         counterpart = links[0][0]
         other.confidence = np.where(counterpart < 0, 0, source.confidence[counterpart])
         other.colors["confidence"] = confidence_colors(other.confidence)
-    sides = [side.packed(up, *link) for side, link in zip((other, source), links, strict=True)]
+    packed = [side.packed(up, *link) for side, link in zip(sides, links, strict=True)]
     names = {"correspondence": "correspondence", "confidence": "confidence"}
     names |= {"carried": "carried from the target"} if "carried" in source.colors else {}
     return fill_page(
@@ -116,13 +119,36 @@ def view_html(match: FileMatch, template: Mesh, up: str, carried: Carried | None
         names=[f"{side.noun}: {side.name}" for side in (other, source)],
         colorings=list(names.items()),
         notes=[side.note for side in (other, source) if side.note],
-        data=script_json({"sides": sides}),
-        plotly=get_plotlyjs(),
+        data=script_json({"sides": packed}),
+        script=script,
+        plotly=None if script else get_plotlyjs(),
     )
 
 
-def sides_of(match: FileMatch, template: Mesh, carried: Carried | None) -> tuple[Side, Side]:
-    """The target, or the template without one, and the source."""
+def thumbnail(sides: tuple[Side, Side], up: str) -> bytes:
+    """Both sides from the front by correspondence, as a small PNG that needs no OpenGL library."""
+    points, faces, colors, left, count = [], [], [], 0.0, 0
+    for side in sides:
+        place = upright(side.mesh.vertices, up)
+        place -= (place.min(axis=0) + place.max(axis=0)) / 2
+        place[:, 0] += left - place[:, 0].min()
+        left = place[:, 0].max() + 0.1 * side.mesh.size
+        points.append(place)
+        faces.append(side.mesh.faces + count)
+        colors.append(side.colors["correspondence"])
+        count += len(place)
+    return encoded(sketch_figure(*map(np.concatenate, (points, faces, colors))), "png")
+
+
+def sides_of(match: FileMatch, template: Mesh, carried: Carried | None = None) -> tuple[Side, Side]:
+    """The target, or the template without one, and the source.
+
+    Args:
+        match: What to show.
+        template: The template of the labels.
+        carried: Colours of the target's vertices, and those carried to the source's, float [W, 3]
+            and [V, 3] in 0..1; None for none.
+    """
     source, target = match.source, match.target
     confidence = source.on_mesh(match.source_confidence)
     if target is None:

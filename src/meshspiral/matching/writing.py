@@ -18,10 +18,11 @@ from meshspiral.matching.export import EXPORT_FILES, write_exports
 from meshspiral.matching.job import FileMatch, MatchJob
 from meshspiral.matching.pictures import draw_pictures, own_colors
 from meshspiral.matching.transfer import transfer
-from meshspiral.matching.viewer import view_html
+from meshspiral.matching.viewer import sides_of, thumbnail, view_html
 from meshspiral.viz.colors import GREY, point_colors, value_colors
 
-RESULT = "match.npz"
+RESULT, THUMBNAIL = "match.npz", "thumbnail.png"
+SCRIPT = "plotly.min.js"  # of the pages of many matches, in the folder of all
 TARGET_FILES = ("target.npz", "target.ply")
 SOURCE_FILES = (
     RESULT,
@@ -35,6 +36,7 @@ SOURCE_FILES = (
     "correspondence.png",
     "confidence.png",
     "view.html",
+    THUMBNAIL,
     *EXPORT_FILES,
 )
 
@@ -73,9 +75,13 @@ def write_match(job: MatchJob, match: FileMatch, folder: Path) -> None:
         write_transferred(folder, scan, values, job.config.transfer)
         carried_colors = colors_of_values(job.transfer_values, values, match, job.config.transfer)
     write_exports(job.config.export, match, template, job.matcher.up, folder)
-    if job.render or not job.config.sources:
-        page = view_html(match, template, job.matcher.up, carried_colors)
-        write_file(folder / "view.html", page)
+    if job.with_page:
+        one_of_many = bool(job.config.sources)
+        sides, up = sides_of(match, template, carried_colors), job.matcher.up
+        script = f"../{SCRIPT}" if one_of_many else None
+        write_file(folder / "view.html", view_html(sides, match, template, up, script))
+        if one_of_many:
+            write_file(folder / THUMBNAIL, thumbnail(sides, up))
     if job.render:
         required = job.config.picture is True
         draw_pictures(folder, match, template, job.matcher.up, required)
