@@ -129,7 +129,8 @@ def test_the_bar_shows_the_stages(cli, trained, files, monkeypatch):
     assert max(map(len, shown)) <= 80
 
 
-def test_a_batch_shows_the_stages_of_its_target(cli, trained, scans):
+def test_a_batch_shows_the_stages_of_its_target(cli, trained, scans, monkeypatch):
+    monkeypatch.setattr("meshspiral.data.progress.in_place", lambda stream: True)
     words = ["sources=scans/*.ply", "target=b.ply", f"run={trained}", "output=out", "workers=1"]
     code, _, err = cli(*words, program=main)
     assert code == 0 and "target: neighbourhoods" in err
