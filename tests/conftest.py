@@ -50,7 +50,7 @@ def toy(tmp_path_factory) -> Path:
 
 
 # the files that take longest, which no process should begin last
-FIRST = ("test_sweeps.py", "test_train.py", "test_extending.py", "test_docs.py")
+FIRST = ("test_sweeps.py", "test_train.py", "test_match.py", "test_cli.py", "test_docs.py")
 
 
 def pytest_collection_modifyitems(items):
