@@ -132,8 +132,10 @@ def test_preprocessing_of_all_bodies_is_omitted_if_it_takes_long(monkeypatch, th
     config = benchmark.BenchmarkConfig.model_construct(repeats=1)
     monkeypatch.setattr(preprocessing_part, "medians", lambda actions, _: dict.fromkeys(actions, 9))
     monkeypatch.setattr(preprocessing_part, "LONGEST", 0.1)
-    rows = preprocessing_part.preprocessing_rows(config, [small("fcs")])
-    assert [row["what"] for row in rows] == ["shot", "spirals of 4 vertices"]
+    network = small("fcs", "neighbourhood.start=frame")
+    shot, frames, spirals = preprocessing_part.preprocessing_rows(config, [network])
+    assert (shot["what"], frames["what"]) == ("shot", "frames of support 0.3")
+    assert spirals["what"].startswith("spirals of 4 vertices, from the frame")
     assert "all 3 bodies: omitted, about" in caplog.text
 
 

@@ -11,6 +11,7 @@ from meshspiral.geometry.mesh import Mesh
 from meshspiral.geometry.sampling import (
     nearest_corners,
     nearest_neighbours,
+    places_of_radii,
     sampled_places,
     surface_directions,
 )
@@ -83,6 +84,18 @@ def test_each_place_gives_the_vertex_with_the_largest_weight_of_its_face():
     assert (
         vertices == np.take_along_axis(table.indices, table.weights.argmax(2)[..., None], 2)[..., 0]
     ).all()
+
+
+def test_several_radii_give_the_places_of_each():
+    mesh = punctured(bumpy_sphere(1, 3), 0.2)
+    start = np.random.default_rng(0).uniform(0, 6, len(mesh.vertices))
+    radii = [0.6, 0.2, 0.4]  # some rings of two of them coincide
+    for radius, table in zip(radii, places_of_radii(mesh, radii, 3, 5, start), strict=True):
+        expected = sampled_places(mesh, radius, 3, 5, start)
+        np.testing.assert_array_equal(table.indices, expected.indices)
+        np.testing.assert_array_equal(table.weights, expected.weights)
+    with pytest.raises(ValueError, match="radius must be positive"):
+        places_of_radii(mesh, [0.2, -1.0], 3, 5, start)
 
 
 def test_a_mesh_coarser_than_the_grid_repeats_vertices():

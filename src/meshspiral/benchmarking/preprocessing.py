@@ -19,6 +19,8 @@ from meshspiral.data.preprocessing import (
     Task,
     compute_task,
     descriptor_task,
+    frame_task,
+    load_task,
     neighbourhood_task,
     run_tasks,
 )
@@ -32,7 +34,8 @@ LONGEST = 600.0
 
 
 def preprocessing_rows(config: BenchmarkConfig, networks: list[TrainConfig]) -> list[Row]:
-    """A row for the descriptors, for each neighbourhood of the networks, and for everything.
+    """A row for the descriptors, for each neighbourhood of the networks and its local frames, and
+    for everything.
 
     The last row is everything for all bodies, with all cores, from an empty cache. It is omitted if
     it would take more than `LONGEST` seconds.
@@ -43,12 +46,16 @@ def preprocessing_rows(config: BenchmarkConfig, networks: list[TrainConfig]) -> 
         makers[descriptor.name] = partial(descriptor_task, descriptor=descriptor)
     for network in networks:
         around = Neighbourhood.of(network.neighbourhood)
+        if frame := around.frame:
+            makers[f"frames of support {frame.support}"] = partial(frame_task, frame=frame)
         makers[around.title] = partial(neighbourhood_task, neighbourhood=around)
     tasks = {name: make(mesh) for name, make in makers.items()}
-    seconds = medians(
-        {name: partial(compute_task, task) for name, task in tasks.items()},
-        config.repeats,
-    )
+    with tempfile.TemporaryDirectory() as folder:
+        cache = Cache(folder)  # of what is in other rows
+        for task in tasks.values():
+            load_task(task, cache)
+        actions = {name: partial(compute_task, task, cache) for name, task in tasks.items()}
+        seconds = medians(actions, config.repeats)
     rows: list[Row] = [{"what": name, "meshes": 1, "seconds": s} for name, s in seconds.items()]
     shapes = open_shapes(data)
     names = [name for split in shapes.names.values() for name in split]

@@ -76,15 +76,32 @@ def geodesic_patches(
         ValueError: `radius` is not positive and finite, or `rings` or `rays` is below 1.
     """
     check_grid(radius, rings, rays)
+    turn = np.zeros(len(mesh.vertices)) if turn is None else turn
+    return patches_at(mesh, (np.arange(rings) + 1) / rings * radius, rays, turn, clamp)
+
+
+def patches_at(
+    mesh: Mesh, distances: np.ndarray, rays: int, turn: np.ndarray, clamp: bool
+) -> PatchTable:
+    """The grids of `geodesic_patches` with rings at any distances.
+
+    Args:
+        mesh: The surface.
+        distances: float [R], ascending, in the mesh's unit.
+        rays, turn, clamp: As in `geodesic_patches`.
+
+    Returns:
+        The table of V * R * rays samples.
+    """
     neighbours, first = one_rings(mesh)
     left = left_corners(mesh.faces, neighbours, first)
-    shape = (len(mesh.vertices), rings, rays, 3)
+    shape = (len(mesh.vertices), len(distances), rays, 3)
     indices, weights = np.zeros(shape, np.int32), np.zeros(shape, np.float32)
     surface = mesh.vertices, neighbours, first, left
-    exits = _exit_edges(neighbours, first, left)
+    exits, apexes = _exit_edges(neighbours, first, left), _apexes(*surface)
     sectors = face_sectors(*surface)
-    turn = np.zeros(len(mesh.vertices)) if turn is None else np.asarray(turn, dtype=np.float64)
-    _trace_all(*surface, exits, sectors, turn, float(radius), clamp, indices, weights)
+    distances, turn = (np.asarray(x, dtype=np.float64) for x in (distances, turn))
+    _trace_all(*surface, exits, apexes, sectors, turn, distances, clamp, indices, weights)
     table = PatchTable(indices, weights)
     if clamp:
         missing = ~table.exists
@@ -174,6 +191,33 @@ def _exit_edges(neighbours, first, left):
 
 
 @njit(cache=True)
+def _apexes(vertices, neighbours, first, left):
+    """The third corner of the face on the left of every directed edge, seen from the edge.
+
+    Args:
+        vertices: float64 [V, 3].
+        neighbours, first: As `one_rings` returns them.
+        left: As `left_corners` returns it.
+
+    Returns:
+        float64 [E, 2]: for the directed edge from c to b, with d on its left, d - b is the first
+        times c - b, plus a vector orthogonal to it, whose length is the second times that of c - b.
+        If b and c coincide, 0 and minus the length of d - b.
+    """
+    apexes = np.zeros((len(neighbours), 2))
+    for c in range(len(first) - 1):
+        for k in range(first[c], first[c + 1]):
+            if left[k] >= 0:
+                along, across = edge_coordinates(vertices, neighbours[k], c, left[k])
+                length = edge_coordinates(vertices, neighbours[k], c, c)[0]
+                if length > 0:
+                    apexes[k, 0], apexes[k, 1] = along / length, across / length
+                else:
+                    apexes[k, 1] = -across
+    return apexes
+
+
+@njit(cache=True)
 def face_sectors(vertices, neighbours, first, left):
     """The interval of directions that the face on the left of every directed edge covers.
 
@@ -203,7 +247,18 @@ def face_sectors(vertices, neighbours, first, left):
 
 @njit(cache=True)
 def _trace_all(
-    vertices, neighbours, first, left, exits, sectors, turn, radius, clamp, indices, weights
+    vertices,
+    neighbours,
+    first,
+    left,
+    exits,
+    apexes,
+    sectors,
+    turn,
+    distances,
+    clamp,
+    indices,
+    weights,
 ):
     """Trace the rays of all vertices; write indices and weights, [V, rings, rays, 3]."""
     rays = indices.shape[2]
@@ -224,7 +279,8 @@ def _trace_all(
                         neighbours,
                         left,
                         exits,
-                        radius,
+                        apexes,
+                        distances,
                         clamp,
                         indices[v, :, ray],
                         weights[v, :, ray],
@@ -242,7 +298,8 @@ def _trace(
     neighbours,
     left,
     exits,
-    radius,
+    apexes,
+    distances,
     clamp,
     indices,
     weights,
@@ -258,7 +315,9 @@ def _trace(
         edge: Index of the directed edge from v whose left face the ray starts in.
         right_angle: Angle at v between that edge and the ray, in radians.
         left_angle: Angle at v between the ray and the face's other edge at v.
-        vertices, neighbours, left, exits, radius, clamp: As in `geodesic_patches`.
+        vertices, neighbours, left: The surface.
+        exits, apexes: Of every directed edge.
+        distances, clamp: As in `patches_at`.
         indices: int32 [rings, 3], written.
         weights: float32 [rings, 3], written.
     """
@@ -269,44 +328,45 @@ def _trace(
     length = edge_coordinates(vertices, v, c, c)[0]
     cx, cy = length * np.cos(left_angle), length * np.sin(left_angle)
     out_x, out_t = _crossing(bx, by, cx, cy)
-    corners = np.array([v, b, c])  # of the current face
-    entry = np.array([1.0, 0.0, 0.0])  # barycentric coordinates where the ray enters the face
-    leave = np.array([0.0, 1 - out_t, out_t])  # and where it leaves
+    # corners of the current face, and barycentric coordinates where the ray enters and leaves it;
+    # in scalars: arrays of three would cost more than all else
+    corner0, corner1, corner2 = v, b, c
+    enter0, enter1 = 1.0, 0.0  # it never enters through the third corner
+    leave0, leave1, leave2 = 0.0, 1 - out_t, out_t
     edge = exits[edge, 0]  # from now on the edge from c to b
     in_x, ring = 0.0, 0
     for _ in range(MOST_FACES):
-        while (ring + 1) / rings * radius <= out_x:
-            x = (ring + 1) / rings * radius
-            part = (x - in_x) / (out_x - in_x)
-            for i in range(3):
-                indices[ring, i] = corners[i]
-                weights[ring, i] = (1 - part) * entry[i] + part * leave[i]
+        while distances[ring] <= out_x:
+            part = (distances[ring] - in_x) / (out_x - in_x)
+            indices[ring, 0], indices[ring, 1], indices[ring, 2] = corner0, corner1, corner2
+            weights[ring, 0] = (1 - part) * enter0 + part * leave0
+            weights[ring, 1] = (1 - part) * enter1 + part * leave1
+            weights[ring, 2] = part * leave2
             ring += 1
             if ring == rings:
                 return
         d = left[edge]
         if d < 0:  # the ray has left the surface
             for rest in range(ring, rings if clamp else ring):
-                for i in range(3):
-                    indices[rest, i], weights[rest, i] = corners[i], leave[i]
+                indices[rest, 0], indices[rest, 1], indices[rest, 2] = corner0, corner1, corner2
+                weights[rest, 0], weights[rest, 1], weights[rest, 2] = leave0, leave1, leave2
             return
+        along, across = apexes[edge]
         ex, ey = cx - bx, cy - by
-        length = np.sqrt(ex * ex + ey * ey)
-        ex, ey = (ex / length, ey / length) if length > 0 else (0.0, 1.0)
-        along, across = edge_coordinates(vertices, b, c, d)
         dx, dy = bx + along * ex + across * ey, by + along * ey - across * ex
-        corners[0], corners[1], corners[2] = b, c, d
-        entry[0], entry[1], entry[2] = 1 - out_t, out_t, 0.0
-        in_x = out_x
+        if across < 0:  # b and c coincide
+            dx, dy = bx - across, by
+        corner0, corner1, corner2 = b, c, d
+        enter0, enter1, in_x = 1 - out_t, out_t, out_x
         edge = exits[edge, 0 if dy > 0 else 1]
         if dy > 0:
             c, cx, cy = d, dx, dy
             out_x, out_t = _crossing(bx, by, cx, cy)
-            leave[0], leave[1], leave[2] = 1 - out_t, 0.0, out_t
+            leave0, leave1, leave2 = 1 - out_t, 0.0, out_t
         else:
             b, bx, by = d, dx, dy
             out_x, out_t = _crossing(bx, by, cx, cy)
-            leave[0], leave[1], leave[2] = 0.0, out_t, 1 - out_t
+            leave0, leave1, leave2 = 0.0, out_t, 1 - out_t
 
 
 @njit(cache=True)

@@ -9,12 +9,20 @@ Vertices are chosen, not blended: it is sub-sampled, not resampled.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from numba import njit
 
 from meshspiral.geometry.connectivity import one_rings
 from meshspiral.geometry.mesh import Mesh
-from meshspiral.geometry.patches import PatchTable, face_sectors, geodesic_patches, left_corners
+from meshspiral.geometry.patches import (
+    PatchTable,
+    check_grid,
+    face_sectors,
+    left_corners,
+    patches_at,
+)
 
 LEAST_TANGENT = 1e-3  # of a unit axis: with less, its direction on the surface means nothing
 
@@ -43,17 +51,42 @@ def sampled_places(
     Raises:
         ValueError: `radius` is not positive and finite, or `rings` or `rays` is below 1.
     """
-    turn = start - np.pi / max(rays, 1)  # ray 0 of a patch lies half a step behind its turn
-    table = geodesic_patches(mesh, radius, rings, rays, turn, clamp=True)
+    return places_of_radii(mesh, [radius], rings, rays, start)[0]
+
+
+def places_of_radii(
+    mesh: Mesh, radii: Sequence[float], rings: int, rays: int, start: np.ndarray
+) -> list[PatchTable]:
+    """`sampled_places` of several radii, whose rays are traced once.
+
+    Args:
+        mesh: The surface.
+        radii: Distances of the outermost rings, in the mesh's unit.
+        rings, rays, start: As in `sampled_places`.
+
+    Returns:
+        The places of each radius.
+
+    Raises:
+        ValueError: A radius is not positive and finite, or `rings` or `rays` is below 1.
+    """
+    for radius in radii:
+        check_grid(radius, rings, rays)
+    wanted = np.multiply.outer(radii, (np.arange(rings) + 1) / rings)
+    distances, ring_of = np.unique(wanted, return_inverse=True)
+    turn = start - np.pi / rays  # ray 0 of a patch lies half a step behind its turn
+    traced = patches_at(mesh, distances, rays, turn, clamp=True)
     count = len(mesh.vertices)
     clockwise = -np.arange(rays) % rays
-    indices, weights = (array[:, :, clockwise].reshape(count, -1, 3) for array in table)
     own = np.repeat(np.arange(count, dtype=np.int32)[:, None, None], 3, axis=2)
     centre = np.zeros((count, 1, 3), np.float32)
     centre[..., 0] = 1.0
-    return PatchTable(
-        np.concatenate([own, indices], axis=1), np.concatenate([centre, weights], axis=1)
-    )
+    tables = []
+    for chosen in ring_of.reshape(wanted.shape):
+        places = (array[:, chosen][:, :, clockwise].reshape(count, -1, 3) for array in traced)
+        both = zip((own, centre), places, strict=True)
+        tables.append(PatchTable(*(np.concatenate(parts, axis=1) for parts in both)))
+    return tables
 
 
 def nearest_corners(places: PatchTable) -> np.ndarray:

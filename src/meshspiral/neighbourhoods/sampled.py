@@ -100,7 +100,7 @@ class Sampled(StartedSequences, name="sampled"):
         in_area = self.settings.relative_to == "area"
         unit = mesh.size if in_area else geodesics.diameter(mesh)
         grid = (self.settings.rings, self.settings.rays, start)
-        tables = [sampling.sampled_places(mesh, radius * unit, *grid) for radius in self._radii]
+        tables = sampling.places_of_radii(mesh, [unit * radius for radius in self._radii], *grid)
         arrays: Arrays = {"known": known}
         if not self.settings.blend:
             arrays["vertices"] = np.stack([sampling.nearest_corners(table) for table in tables])
