@@ -4,6 +4,7 @@ import json
 import re
 import sys
 import time
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -231,6 +232,24 @@ def test_a_series_stops_before_it_takes_half_of_the_free_memory(monkeypatch):
         assert row["exponent of MB"] is None
     monkeypatch.setattr(memory, "free_bytes", lambda: None)  # unknown: nothing is left out
     assert scaling.scaling_rows(config, [])[0]["sizes"] == scaling.SIZES
+
+
+def test_a_series_stops_before_a_size_that_takes_long(monkeypatch):
+    """A size takes the cube of itself: 1, 8 and 64 seconds; the next one would take 512."""
+    now = [0.0]
+
+    def measured(_, config, series, size):
+        now[0] += (size / 10) ** 3
+        return 1.0, None
+
+    monkeypatch.setattr(scaling, "in_own_process", measured)
+    monkeypatch.setattr(scaling, "time", SimpleNamespace(perf_counter=lambda: now[0]))
+    monkeypatch.setattr(scaling, "SIZES", [10, 20, 40, 80, 160])
+    monkeypatch.setattr(scaling, "LONGEST", 500.0)
+    config = benchmark.BenchmarkConfig.model_construct(vertices=1500)
+    for row in scaling.scaling_rows(config, []):
+        assert row["sizes"] == [10, 20, 40]
+        assert row["stopped"] == "before 80: about 9 minutes"
 
 
 def test_a_network_too_large_for_the_memory_is_omitted_with_a_warning(monkeypatch, caplog):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from typing import NamedTuple
 
 import numpy as np
@@ -21,6 +22,7 @@ from meshspiral.training.device import keep_freed_memory, set_up_process
 
 SIZES = [1500, 3000, 6000, 12_000, 25_000, 50_000, 100_000]
 LENGTHS = [10, 15, 20, 30, 40, 60]
+LONGEST = 600.0  # seconds of one size
 TEMPLATE = 1500  # vertices of the template where it does not grow
 
 
@@ -59,19 +61,27 @@ def scaling_rows(config: BenchmarkConfig, networks: list[TrainConfig]) -> list[R
 
     "MB" are those beyond parameters and inputs; None on systems other than Linux. The exponents are
     those of the upper half of the sizes. A series stops before a size that would take more than
-    half of the free memory, by extrapolation in proportion; "stopped" says where.
+    half of the free memory, by extrapolation in proportion, or longer than `LONGEST`, preparation
+    included, as the last two sizes grew; "stopped" says where.
     """
     rows = []
     for series in all_series(networks):
         costs: list[tuple[float, float | None]] = []
+        taken: list[float] = []  # seconds, preparation included
         stopped = ""
         for size in Progress(series.sizes, desc=f"{series.what} over {series.over}"):
-            if costs and costs[-1][1] is not None:
-                expected = costs[-1][1] * size / series.sizes[len(costs) - 1]
-                if too_large(1e6 * expected):
-                    stopped = f"before {size:,}: about {expected / 1e3:.1f} GB"
+            if costs:
+                ratio = size / series.sizes[len(costs) - 1]
+                if costs[-1][1] is not None and too_large(1e6 * costs[-1][1] * ratio):
+                    stopped = f"before {size:,}: about {costs[-1][1] * ratio / 1e3:.1f} GB"
                     break
+                power = exponent(series.sizes[len(taken) - 2 : len(taken)], taken[-2:]) or 1.0
+                if (expected := taken[-1] * ratio**power) > LONGEST:
+                    stopped = f"before {size:,}: about {expected / 60:.0f} minutes"
+                    break
+            began = time.perf_counter()
             costs.append(in_own_process(pass_cost, config, series, size))
+            taken.append(time.perf_counter() - began)
         seconds, megabytes = (list(values) for values in zip(*costs, strict=True))
         sizes = series.sizes[: len(costs)]
         rows.append(
