@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import json
+
 import numpy as np
 import pytest
 import torch
 
 from meshspiral import Matcher, scan
 from meshspiral.benchmarking.steps import training_loss, training_step
+from meshspiral.commands import evaluate
 from meshspiral.data.descriptors import Features
 from meshspiral.data.tensors import draw, mesh_tensors
-from meshspiral.experiment.run_folder import Stopped
+from meshspiral.experiment.run_folder import METRICS, Stopped
 from meshspiral.neighbourhoods import Neighbourhood
 from meshspiral.nn.networks import Network
 from tests.conftest import toy_shapes
@@ -30,12 +33,17 @@ def test_every_network_has_a_small_version():
 
 
 @pytest.mark.parametrize("model", MODELS)
-def test_it_trains_stops_resumes_to_the_bit_and_matches(
-    model, toy_overrides, tmp_path, monkeypatch
+def test_it_trains_stops_resumes_to_the_bit_is_tested_again_and_matches(
+    cli, model, toy_overrides, tmp_path, monkeypatch
 ):
     overrides = [*words(model, toy_overrides), "optim.epochs=2"]
     metrics = run(tmp_path / "whole", overrides)
     assert np.isfinite(list(metrics.values())).all()
+
+    code, _, err = cli(f"run={tmp_path / 'whole'}", "shapes=0", program=evaluate.main)
+    assert code == 0, err
+    again = json.loads((tmp_path / "whole/evaluation/folder" / METRICS).read_text())
+    assert again == pytest.approx({key: metrics[key] for key in again}, rel=1e-6)
 
     go_on = stop_at(monkeypatch, 8)
     with pytest.raises(Stopped):
