@@ -42,6 +42,12 @@ def test_training_after_it_reads_no_mesh(cli, arguments, toy_overrides, tmp_path
     assert set(read) == {"val_0"}  # drawn in TensorBoard
 
 
+def test_several_data_sets_leave_nothing_outside_outputs(cli, arguments, tmp_path):
+    code, out, err = cli("-m", *arguments, "seq_len=8,9", program=preprocess.main)
+    assert code == 0 and out.count("12 meshes prepared") == 2, err
+    assert {path.name for path in tmp_path.iterdir()} == {"outputs", "cache"}
+
+
 def test_the_rest_of_the_cache_can_be_removed(cli, arguments, tmp_path):
     """What was prepared counts as read, although it was there before; all else is old."""
     remeshed = ["data/remesh=isotropic", "data.remesh.vertices=100"]
