@@ -35,7 +35,7 @@ class Progress(tqdm):
     def refresh(self, *args: Any, **options: Any) -> None:
         """Show the present state; in a file, once the next line is due."""
         now = time.time()
-        if in_place(sys.stderr):
+        if self.disable or in_place(sys.stderr):
             super().refresh(*args, **options)
         elif now - self.last_print_t >= self.mininterval and now >= self.start_t + self.delay:
             super().refresh(*args, **options)
