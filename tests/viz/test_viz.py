@@ -21,9 +21,9 @@ from meshspiral.viz.plots import (
     curve_figure,
     encoded,
     neighbourhood_figure,
-    sketch_figure,
 )
 from meshspiral.viz.render import Row, render, upright
+from meshspiral.viz.sketch import sketch
 from tests.meshes import bumpy_sphere, lattice
 
 
@@ -104,19 +104,30 @@ def test_a_flat_mesh_is_drawn():
     for axis in range(3):
         flat = Mesh(np.insert(mesh.vertices[:, :2], axis, 0.0, axis=1), mesh.faces)
         rows.append(Row([flat], [np.ones((16, 3))]))
-        assert encoded(sketch_figure(flat.vertices, flat.faces, rows[-1].colors[0]), "png")
+        assert sketch(flat.vertices, flat.faces, rows[-1].colors[0]).shape[0] == 320
     for picture in render(rows, "y"):
         assert picture.images[0].shape[1] < 25 * picture.images[0].shape[0]
 
 
+SQUARE = np.array([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]])
+FACES = np.array([[0, 1, 2], [0, 2, 3]])
+
+
 def test_a_sketch_shows_the_inside_through_a_hole_darker():
-    sheet = lattice(4, 4)
-    colors = np.ones((16, 3))
-    front, back = (
-        sketch_figure(sheet.vertices, faces, colors).axes[0].collections[0].get_facecolor()[:, 0]
-        for faces in (sheet.faces, sheet.faces[:, ::-1])
-    )
-    np.testing.assert_allclose([front, back], [np.ones(18), np.full(18, 0.5)])
+    colors = np.ones((4, 3)) * [1.0, 0.6, 0.2]
+    for faces, shade in ((FACES, 1.0), (FACES[:, ::-1], 0.5)):
+        image = sketch(SQUARE, faces, colors, 100)
+        assert image.shape == (100, 100, 3) and (image[0] == 255).all()
+        np.testing.assert_allclose(image[50, 50], 255 * shade * colors[0], atol=1)
+
+
+def test_a_sketch_shows_what_is_in_front():
+    points = np.concatenate([SQUARE, SQUARE * [2, 1, 1] - [0, 0, 1]])
+    faces, colors = np.concatenate([FACES, FACES + 4]), np.repeat([[1.0, 0, 0], [0, 0, 1.0]], 4, 0)
+    image = sketch(points, faces, colors, 100)
+    assert image.shape == (100, 200, 3)
+    assert image[50, 50].tolist() == [255, 0, 0] and image[50, 150].tolist() == [0, 0, 255]
+    assert sketch(points * [50, 1, 1], faces, colors, 100).shape == (100, 500, 3)
 
 
 def test_neighbourhoods_of_one_point_are_seen_from_one_side():

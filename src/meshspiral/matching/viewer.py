@@ -16,8 +16,8 @@ from meshspiral.matching.pictures import align_to_template, own_colors
 from meshspiral.matching.transfer import transfer
 from meshspiral.viz.colors import GREY, confidence_colors, point_colors, template_colors
 from meshspiral.viz.pages import fill_page, pack_array, script_json
-from meshspiral.viz.plots import encoded, sketch_figure
 from meshspiral.viz.render import upright
+from meshspiral.viz.sketch import png, sketch
 
 MOST_VERTICES = 20_000  # shown of a mesh; a larger one is thinned
 TIP = 0.012  # height of a mark over the surface, over its size
@@ -137,7 +137,7 @@ def thumbnail(sides: tuple[Side, Side], up: str) -> bytes:
         faces.append(side.mesh.faces + count)
         colors.append(side.colors["correspondence"])
         count += len(place)
-    return encoded(sketch_figure(*map(np.concatenate, (points, faces, colors))), "png")
+    return png(sketch(*map(np.concatenate, (points, faces, colors))))
 
 
 def sides_of(match: FileMatch, template: Mesh, carried: Carried | None = None) -> tuple[Side, Side]:

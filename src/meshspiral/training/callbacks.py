@@ -15,8 +15,9 @@ from meshspiral.data.progress import Progress
 from meshspiral.evaluation.metrics import THRESHOLDS
 from meshspiral.experiment.run_folder import LAST, Stopped
 from meshspiral.viz.colors import template_colors
-from meshspiral.viz.plots import curve_figure, sketch_figure
+from meshspiral.viz.plots import curve_figure
 from meshspiral.viz.render import upright
+from meshspiral.viz.sketch import sketch
 
 # fits 80 columns with a bar: no count of steps, no words that the metrics explain
 BAR_FORMAT = "{desc} {percentage:3.0f}%|{bar}| {elapsed}<{remaining}, {rate_fmt}{postfix}"
@@ -213,8 +214,9 @@ class Figures(Callback):
             data = trainer.datamodule
             mesh = data.shape(data.shapes.names["val"][0]).mesh
             colors = template_colors(data.shapes.template)[module.results["val"][0].predicted]
-            figure = sketch_figure(upright(mesh.vertices, data.shapes.up), mesh.faces, colors)
-            trainer.logger.experiment.add_figure("val/shape", figure, trainer.current_epoch)
+            image = sketch(upright(mesh.vertices, data.shapes.up), mesh.faces, colors, 640)
+            writer = trainer.logger.experiment
+            writer.add_image("val/shape", image, trainer.current_epoch, dataformats="HWC")
         self._spent += time.perf_counter() - now
 
     def on_test_end(self, trainer: L.Trainer, module: L.LightningModule) -> None:

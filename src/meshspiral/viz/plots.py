@@ -1,4 +1,4 @@
-"""Figures by matplotlib: error curves, costs, renders with captions, and sketches of meshes.
+"""Figures by matplotlib: error curves, costs, and renders with captions.
 
 All functions return a `Figure` that belongs to no window system; save it with `savefig`.
 """
@@ -245,33 +245,3 @@ def _tangent_plane(normal: np.ndarray, up: str) -> np.ndarray:
     right = np.cross(axis, normal)
     right /= np.linalg.norm(right)
     return np.stack([right, np.cross(normal, right)])
-
-
-def sketch_figure(points: np.ndarray, faces: np.ndarray, colors: np.ndarray) -> Figure:
-    """A rough render of a mesh seen from +z with y up, in a tenth of a second.
-
-    Faces are drawn from back to front, before them those that face away, in darker colours: they
-    are seen through holes.
-
-    Args:
-        points: float [V, 3].
-        faces: int [F, 3].
-        colors: float [V, 3] in 0..1.
-    """
-    corners = points[faces]
-    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    facing = normals[:, 2] / np.maximum(np.linalg.norm(normals, axis=1), 1e-300)
-    seen = np.lexsort((corners[..., 2].mean(axis=1), facing > 0))
-    facing = facing[seen, None]
-    shade = np.where(facing > 0, 0.35 + 0.65 * facing, 0.35 - 0.15 * facing)
-    size = np.ptp(points, axis=0)
-    figure = Figure(figsize=(5 * min(max(0.2, size[0] / max(size[1], 1e-300)), 5), 5))
-    axes = figure.add_axes((0, 0, 1, 1))
-    paint = shade * colors[faces[seen]].mean(axis=1)
-    axes.add_collection(
-        PolyCollection(corners[seen, :, :2], facecolors=paint, edgecolors=paint, linewidths=0.3)
-    )
-    axes.autoscale_view()
-    axes.set_aspect("equal")
-    axes.axis("off")
-    return figure
