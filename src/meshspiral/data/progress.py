@@ -28,18 +28,22 @@ class Progress(tqdm):
 
     def __init__(self, *args: Any, **options: Any) -> None:
         if not in_place(sys.stderr):
-            options |= {"mininterval": EVERY, "bar_format": LINE, "file": Lines(sys.stderr)}
+            options |= {"mininterval": EVERY, "miniters": 1, "bar_format": LINE}
+            options["file"] = Lines(sys.stderr)
             options.setdefault("delay", 1.0)
+        self._began, self._line = time.time(), 0.0
         super().__init__(*args, **options)
 
     def refresh(self, *args: Any, **options: Any) -> None:
         """Show the present state; in a file, once the next line is due."""
-        now = time.time()
         if self.disable or in_place(sys.stderr):
             super().refresh(*args, **options)
-        elif now - self.last_print_t >= self.mininterval and now >= self.start_t + self.delay:
+            return
+        now = time.time()
+        due = self._line + self.mininterval, self._began + self.delay
+        if now >= max(due):
             super().refresh(*args, **options)
-            self.last_print_t = now
+            self._line = now
 
 
 class Lines:
