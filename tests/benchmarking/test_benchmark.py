@@ -135,7 +135,7 @@ def test_preprocessing_of_all_bodies_is_omitted_if_it_takes_long(monkeypatch, th
     monkeypatch.setattr(preprocessing_part, "LONGEST", 0.1)
     network = small("fcs", "neighbourhood.start=frame")
     shot, frames, spirals = preprocessing_part.preprocessing_rows(config, [network])
-    assert (shot["what"], frames["what"]) == ("shot", "frames of support 0.3")
+    assert (shot["what"], frames["what"]) == ("shot", "frames of support 0.3, by area")
     assert spirals["what"].startswith("spirals of 4 vertices, from the frame")
     assert "all 3 bodies: omitted, about" in caplog.text
 

@@ -212,13 +212,24 @@ def test_a_mesh_that_a_repair_cut_open_is_rendered(cli, trained, files):
     assert code == 0 and "1 repaired" in out
     assert "cut open" in Path("many/a/remarks.txt").read_text()
     assert 'src="../plotly.min.js"' in Path("many/a/view.html").read_text()
-    assert Path("many/a/thumbnail.png").read_bytes().startswith(b"\x89PNG")
+    assert Path("many/a/match_thumbnail.png").read_bytes().startswith(b"\x89PNG")
     assert Path("many/plotly.min.js").is_file()
     code, out, _ = cli(*sources, "picture=true", program=main)
     assert code == 0 and Path("many/a/correspondence.png").exists()
     code, out, _ = cli(*sources, "picture=false", program=main)
     assert code == 0 and not list(Path("many/a").glob("*.png"))
     assert not Path("many/a/view.html").exists()
+
+
+def test_a_mesh_that_cannot_be_shown_is_matched_among_many(cli, trained, files, monkeypatch):
+    def fails(*_):
+        raise ValueError("nothing to align")
+
+    monkeypatch.setattr("meshspiral.matching.viewer.align_to_template", fails)
+    words = ["sources=a.ply", f"run={trained}", "output=many", "workers=1"]
+    code, out, err = cli(*words, program=main)
+    assert code == 0 and "a.ply: no view.html: nothing to align" in out + err
+    assert Path("many/a/match.npz").exists() and not Path("many/a/view.html").exists()
 
 
 def test_without_opengl_renders_are_skipped(cli, trained, files, monkeypatch):
@@ -366,7 +377,8 @@ def test_many_are_matched_and_finished_ones_are_skipped(cli, trained, scans):
     assert "broken.ply: not a readable PLY" in Path("out/refused.txt").read_text()
     assert "3 meshes matched" in out and "(0 repaired, see remarks.txt), 1 refused" in out
     written = sorted(path.name for path in Path("out/0").iterdir())
-    assert written == ["map.txt", "match.npz", "remarks.txt", "source.ply", "template.txt"]
+    files = ["map.txt", "match.npz", "match_thumbnail.png", "remarks.txt", "source.ply"]
+    assert written == [*files, "template.txt", "view.html"]
     assert Path("out/target.npz").exists() and Path("out/target.ply").exists()
 
     before = {i: os.stat(f"out/{i}/match.npz").st_mtime_ns for i in range(3)}
@@ -436,7 +448,7 @@ def test_a_full_disk_ends_the_command_and_keeps_finished_matches(cli, trained, s
     @contextlib.contextmanager
     def full_disk(path, sync=False):
         written.append(path)
-        if len(written) > 5:  # the second file of the second mesh
+        if len(written) > 8:  # after Plotly's script and six files: the second mesh's second file
             raise OSError(errno.ENOSPC, "No space left on device", str(path))
         with atomic_file(path, sync) as file:
             yield file
@@ -445,6 +457,7 @@ def test_a_full_disk_ends_the_command_and_keeps_finished_matches(cli, trained, s
         patch.setattr("meshspiral.data.files.atomic_file", full_disk)
         code, out, err = cli(*common, program=main)
     assert code == 1 and "No space left on device" in out and "Traceback" not in out + err
+    assert Path("out/0/view.html").exists() and Path("out/plotly.min.js").exists()
     code, out, _ = cli(*common, program=main)
     assert code == 0 and "1 of 3 meshes are already matched" in out and "2 meshes matched" in out
 

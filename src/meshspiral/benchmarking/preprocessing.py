@@ -13,14 +13,13 @@ from joblib import cpu_count
 from meshspiral.benchmarking.inputs import first_body
 from meshspiral.benchmarking.measure import Row, medians
 from meshspiral.data.cache import Cache
-from meshspiral.data.descriptors import Features
+from meshspiral.data.descriptors import Descriptor, Features
 from meshspiral.data.fitting import fitted_to
 from meshspiral.data.preprocessing import (
     Task,
     compute_task,
     descriptor_task,
     frame_task,
-    load_task,
     neighbourhood_task,
     run_tasks,
 )
@@ -30,12 +29,12 @@ from meshspiral.geometry.mesh import Mesh
 from meshspiral.neighbourhoods import Neighbourhood
 
 log = logging.getLogger(__name__)
-LONGEST = 600.0
+LONGEST = 600.0  # seconds for all bodies
 
 
 def preprocessing_rows(config: BenchmarkConfig, networks: list[TrainConfig]) -> list[Row]:
-    """A row for the descriptors, for each neighbourhood of the networks and its local frames, and
-    for everything.
+    """A row for each descriptor, each neighbourhood of the networks, the local frames that these
+    need, and everything.
 
     The last row is everything for all bodies, with all cores, from an empty cache. It is omitted if
     it would take more than `LONGEST` seconds.
@@ -43,17 +42,15 @@ def preprocessing_rows(config: BenchmarkConfig, networks: list[TrainConfig]) -> 
     data, makers = networks[0].data, dict[str, Callable[[Mesh], Task]]()
     mesh = first_body(networks[0]).mesh
     for descriptor in fitted_to(Features.of(data), [mesh]).descriptors:
+        makers |= _frame_maker(descriptor)
         makers[descriptor.name] = partial(descriptor_task, descriptor=descriptor)
     for network in networks:
         around = Neighbourhood.of(network.neighbourhood)
-        if frame := around.frame:
-            makers[f"frames of support {frame.support}"] = partial(frame_task, frame=frame)
+        makers |= _frame_maker(around)
         makers[around.title] = partial(neighbourhood_task, neighbourhood=around)
     tasks = {name: make(mesh) for name, make in makers.items()}
     with tempfile.TemporaryDirectory() as folder:
         cache = Cache(folder)  # of what is in other rows
-        for task in tasks.values():
-            load_task(task, cache)
         actions = {name: partial(compute_task, task, cache) for name, task in tasks.items()}
         seconds = medians(actions, config.repeats)
     rows: list[Row] = [{"what": name, "meshes": 1, "seconds": s} for name, s in seconds.items()]
@@ -71,3 +68,11 @@ def preprocessing_rows(config: BenchmarkConfig, networks: list[TrainConfig]) -> 
         run_tasks(every_task, Cache(folder), None, "Bodies")
         everything = time.perf_counter() - began
     return [*rows, {"what": "everything", "meshes": len(names), "seconds": everything}]
+
+
+def _frame_maker(user: Descriptor | Neighbourhood) -> dict[str, Callable[[Mesh], Task]]:
+    """The local frames that a descriptor or a neighbourhood needs, by name; empty for none."""
+    if (frame := user.frame) is None:
+        return {}
+    weights = "by area" if frame.by_area else "counted"
+    return {f"frames of support {frame.support}, {weights}": partial(frame_task, frame=frame)}

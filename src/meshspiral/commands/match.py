@@ -121,7 +121,13 @@ def match_many(config: MatchConfig) -> Path:
     from meshspiral.matching.batch import find_sources, match_batch
     from meshspiral.matching.index import INDEX, write_index
     from meshspiral.matching.job import MatchJob
-    from meshspiral.matching.writing import TARGET_FILES, delete_files, delete_match, write_target
+    from meshspiral.matching.writing import (
+        TARGET_FILES,
+        delete_files,
+        delete_match,
+        write_script,
+        write_target,
+    )
 
     folder = Path(config.output or Path("outputs", "matches", legal_name(config.sources)))
     sources = find_sources(config.sources, folder)
@@ -132,6 +138,8 @@ def match_many(config: MatchConfig) -> Path:
         write_target(job, folder)
     else:
         delete_files(folder, TARGET_FILES)
+    if job.with_page:
+        write_script(folder)  # before the pages, which a stopped command leaves
     began = time.perf_counter()
     result = match_batch(job, sources, folder, config.workers)
     log.info(

@@ -8,10 +8,9 @@ from typing import NamedTuple
 from urllib.parse import quote
 
 import numpy as np
-from plotly.offline import get_plotlyjs
 
 from meshspiral.data.files import write_file
-from meshspiral.matching.writing import RESULT, SCRIPT, THUMBNAIL
+from meshspiral.matching.writing import RESULT, THUMBNAIL
 from meshspiral.viz.pages import fill_page
 
 INDEX = "index.html"
@@ -37,7 +36,7 @@ class Entry(NamedTuple):
 
 
 def write_index(folder: Path, names: Iterable[str], refused: Iterable[str]) -> None:
-    """Write index.html, and the script that the pages of the matches share.
+    """Write index.html.
 
     Args:
         folder: The folder of all matches.
@@ -53,8 +52,6 @@ def write_index(folder: Path, names: Iterable[str], refused: Iterable[str]) -> N
         refused=sorted(refused),
         pictured=any(entry.picture for entry in entries),
     )
-    if any(entry.picture for entry in entries):
-        write_file(folder / SCRIPT, get_plotlyjs())
     write_file(folder / INDEX, html)
 
 

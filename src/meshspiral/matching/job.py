@@ -174,7 +174,8 @@ class MatchJob:
     def _shared_key(self) -> str:
         files = [str(Path(self.config.run or BUNDLED_RUN) / BEST), *self.inputs]
         settings = self.config.model_dump_json(exclude=NOT_IN_KEY)
-        return digest(*map(_content, files), settings, self.render, self.with_page, CONTENT)
+        files_written = self.render, self.with_page, bool(self.config.sources)
+        return digest(*map(_content, files), settings, *files_written, CONTENT)
 
 
 @lru_cache(maxsize=1)

@@ -1,4 +1,7 @@
-"""The page of a match: both meshes side by side, in one HTML file that needs no network."""
+"""The page of a match: both meshes side by side, in one HTML file that needs no network.
+
+The pages of many sources share Plotly's script instead of holding it.
+"""
 
 from __future__ import annotations
 

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import io
+import logging
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import trimesh
+from plotly.offline import get_plotlyjs
 
 from meshspiral.data.files import write_arrays, write_file
 from meshspiral.data.scans import Scan
@@ -18,10 +20,11 @@ from meshspiral.matching.export import EXPORT_FILES, write_exports
 from meshspiral.matching.job import FileMatch, MatchJob
 from meshspiral.matching.pictures import draw_pictures, own_colors
 from meshspiral.matching.transfer import transfer
-from meshspiral.matching.viewer import sides_of, thumbnail, view_html
+from meshspiral.matching.viewer import Carried, sides_of, thumbnail, view_html
 from meshspiral.viz.colors import GREY, point_colors, value_colors
 
-RESULT, THUMBNAIL = "match.npz", "thumbnail.png"
+log = logging.getLogger(__name__)
+RESULT, THUMBNAIL = "match.npz", "match_thumbnail.png"
 SCRIPT = "plotly.min.js"  # of the pages of many matches, in the folder of all
 TARGET_FILES = ("target.npz", "target.ply")
 SOURCE_FILES = (
@@ -76,17 +79,37 @@ def write_match(job: MatchJob, match: FileMatch, folder: Path) -> None:
         carried_colors = colors_of_values(job.transfer_values, values, match, job.config.transfer)
     write_exports(job.config.export, match, template, job.matcher.up, folder)
     if job.with_page:
-        one_of_many = bool(job.config.sources)
-        sides, up = sides_of(match, template, carried_colors), job.matcher.up
-        script = f"../{SCRIPT}" if one_of_many else None
-        write_file(folder / "view.html", view_html(sides, match, template, up, script))
-        if one_of_many:
-            write_file(folder / THUMBNAIL, thumbnail(sides, up))
+        write_page(job, match, folder, carried_colors)
     if job.render:
         required = job.config.picture is True
         draw_pictures(folder, match, template, job.matcher.up, required)
     origin = {"key": np.array(job.key(match.path)), "source": np.array(_absolute(match.path))}
     write_arrays(folder / RESULT, **origin, **arrays)  # the last file: now the match is complete
+
+
+def write_page(job: MatchJob, match: FileMatch, folder: Path, carried: Carried | None) -> None:
+    """Write view.html, and for one of many sources its thumbnail.
+
+    For one of many, a mesh that cannot be shown is a warning.
+    """
+    template, up, one_of_many = job.matcher.template, job.matcher.up, bool(job.config.sources)
+    try:
+        sides = sides_of(match, template, carried)
+    except (MeshError, ValueError) as error:
+        if not one_of_many:
+            raise
+        log.warning("%s: no view.html: %s", match.path, error)
+        return
+    script = f"../{SCRIPT}" if one_of_many else None
+    write_file(folder / "view.html", view_html(sides, match, template, up, script))
+    if one_of_many:
+        write_file(folder / THUMBNAIL, thumbnail(sides, up))
+
+
+def write_script(folder: Path) -> None:
+    """Write what the pages of many sources share, into the folder of all of them."""
+    folder.mkdir(parents=True, exist_ok=True)
+    write_file(folder / SCRIPT, get_plotlyjs())
 
 
 def write_target(job: MatchJob, folder: Path) -> None:

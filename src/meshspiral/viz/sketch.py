@@ -1,4 +1,4 @@
-"""Rough renders of meshes, which take a tenth of a second and need no OpenGL library."""
+"""Rough renders of meshes, for small pictures: quick, and without an OpenGL library."""
 
 from __future__ import annotations
 
