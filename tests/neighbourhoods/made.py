@@ -1,7 +1,10 @@
-"""Neighbourhoods with settings for tests."""
+"""Neighbourhoods with settings for tests, and batches of one mesh."""
 
 from __future__ import annotations
 
+from meshspiral.data.descriptors import Features
+from meshspiral.data.descriptors.xyz import Xyz
+from meshspiral.data.tensors import mesh_tensors
 from meshspiral.neighbourhoods.patch import Patch
 from meshspiral.neighbourhoods.sampled import Sampled
 from meshspiral.neighbourhoods.spiral import Spiral
@@ -29,3 +32,9 @@ def patch(radius=0.1, rings=3, rays=8, weights="interpolation", ring_width=2.0) 
         "ring_width": ring_width,
     }
     return Patch(Patch.Settings(name="patch", **settings))
+
+
+def tensors_of(mesh, neighbourhood) -> dict:
+    """A batch of a mesh, described by its positions, with nothing drawn yet."""
+    features = Features((Xyz(Xyz.Settings(rotate=False)),), 1.0)
+    return {**mesh_tensors(mesh, features, neighbourhood), "index": 0}

@@ -6,14 +6,11 @@ import numpy as np
 import pytest
 import torch
 
-from meshspiral.data.descriptors import Features
-from meshspiral.data.descriptors.xyz import Xyz
-from meshspiral.data.tensors import mesh_tensors
 from meshspiral.geometry.mesh import Mesh
 from meshspiral.geometry.spirals import spiral_table
 from meshspiral.nn.geodesic import Resampling, resample
 from tests.meshes import bow_tie, bumpy_sphere, lattice, punctured, two_cones, union
-from tests.neighbourhoods.made import sampled, spiral
+from tests.neighbourhoods.made import sampled, spiral, tensors_of
 
 
 def folded(mesh: Mesh) -> Mesh:
@@ -53,8 +50,7 @@ every_mesh = pytest.mark.parametrize("mesh", MESHES.values(), ids=MESHES)
 
 
 def drawn(mesh: Mesh, neighbourhood, seed: int = 0, training: bool = True) -> dict:
-    features = Features((Xyz(Xyz.Settings(rotate=False)),), 1.0)
-    tensors = {**mesh_tensors(mesh, features, neighbourhood), "index": 0}
+    tensors = tensors_of(mesh, neighbourhood)
     return neighbourhood.draw(tensors, torch.Generator().manual_seed(seed), training)
 
 

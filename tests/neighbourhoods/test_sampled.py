@@ -6,9 +6,6 @@ import numpy as np
 import pytest
 import torch
 
-from meshspiral.data.descriptors import Features
-from meshspiral.data.descriptors.xyz import Xyz
-from meshspiral.data.tensors import mesh_tensors
 from meshspiral.geometry.geodesics import diameter
 from meshspiral.geometry.patches import first_directions
 from meshspiral.geometry.sampling import nearest_corners, sampled_places, surface_directions
@@ -18,14 +15,7 @@ from meshspiral.nn.geodesic import Resampling, resample
 from meshspiral.nn.layers import metric_features
 from meshspiral.nn.networks import ConvNet, FCSNet, LSTMNet
 from tests.meshes import bumpy_sphere, lattice, punctured, union
-from tests.neighbourhoods.made import sampled
-
-
-def tensors_of(mesh, neighbourhood):
-    return {
-        **mesh_tensors(mesh, Features((Xyz(Xyz.Settings(rotate=False)),), 1.0), neighbourhood),
-        "index": 0,
-    }
+from tests.neighbourhoods.made import sampled, tensors_of
 
 
 def drawn_from(neighbourhood, tensors, seed=0, training=False):

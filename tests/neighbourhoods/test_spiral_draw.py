@@ -6,22 +6,13 @@ import numpy as np
 import pytest
 import torch
 
-from meshspiral.data.descriptors import Features
-from meshspiral.data.descriptors.xyz import Xyz
-from meshspiral.data.tensors import draw, mesh_tensors
+from meshspiral.data.tensors import draw
 from meshspiral.geometry.mesh import Mesh
 from meshspiral.geometry.sampling import nearest_neighbours
 from meshspiral.geometry.shot import local_frames
 from meshspiral.geometry.spirals import spiral_table
 from tests.meshes import bumpy_sphere, lattice, punctured, union
-from tests.neighbourhoods.made import spiral
-
-
-def tensors_of(mesh, neighbourhood):
-    return {
-        **mesh_tensors(mesh, Features((Xyz(Xyz.Settings(rotate=False)),), 1.0), neighbourhood),
-        "index": 0,
-    }
+from tests.neighbourhoods.made import spiral, tensors_of
 
 
 def drawn_from(neighbourhood, tensors, seed=0, training=False):
