@@ -71,11 +71,12 @@ def scaling_rows(config: BenchmarkConfig, networks: list[TrainConfig]) -> list[R
         stopped = ""
         for size in Progress(series.sizes, desc=f"{series.what} over {series.over}"):
             if costs:
-                ratio = size / series.sizes[len(costs) - 1]
-                if costs[-1][1] is not None and too_large(1e6 * costs[-1][1] * ratio):
-                    stopped = f"before {size:,}: about {costs[-1][1] * ratio / 1e3:.1f} GB"
+                known = series.sizes[: len(costs)]
+                ratio, used = size / known[-1], costs[-1][1]
+                if used is not None and too_large(1e6 * used * ratio):
+                    stopped = f"before {size:,}: about {used * ratio / 1e3:.1f} GB"
                     break
-                power = exponent(series.sizes[len(taken) - 2 : len(taken)], taken[-2:]) or 1.0
+                power = exponent(known[-2:], taken[-2:]) or 1.0
                 if (expected := taken[-1] * ratio**power) > LONGEST:
                     stopped = f"before {size:,}: about {expected / 60:.0f} minutes"
                     break
